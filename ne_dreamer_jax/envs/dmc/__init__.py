@@ -1,0 +1,104 @@
+"""The DeepMind Control Suite on MJX, stepped, rewarded and observed as dm_control does it."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.envs import base
+from ne_dreamer_jax.envs.dmc.common import Episode, Task, mjx
+from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec
+
+_MAX_VALUE = 1e10  # MuJoCo's own bound (mjMAXVAL) beyond which a position or velocity counts as broken
+_OBSERVATIONS = ("pixels", "vector", "both")
+
+
+class State(NamedTuple):
+    """State of a task, between control steps."""
+
+    physics: mjx.Data
+    episode: Episode
+    steps_left: Array  # int32 [], control steps until the time limit
+
+
+def load(domain: str, task: str) -> Task:
+    """The definition of a task, from the module named after its domain."""
+    return importlib.import_module(f"ne_dreamer_jax.envs.dmc.{domain}").load(task)
+
+
+def make(
+    domain: str, task: str, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64
+) -> base.Env:
+    """Makes a Control Suite environment. Its ``env_state.physics`` is the ``mjx.Data``.
+
+    Args:
+      domain, task: as the registry lists them.
+      obs: ``"pixels"``: ``image``, uint8 [image_size, image_size, 3]; ``"vector"``: dm_control's own observations
+        under their own names, float32; ``"both"``.
+      action_repeat: control steps per step; their rewards are added up.
+      image_size: height and width of the image in pixels.
+
+    Raises:
+      ValueError: an option has a bad value.
+    """
+    if obs not in _OBSERVATIONS:
+        raise ValueError(f"expected obs to be one of {', '.join(_OBSERVATIONS)}, got {obs!r}")
+    for name, value in (("action_repeat", action_repeat), ("image_size", image_size)):
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"expected {name} to be a positive int, got {value!r}")
+    return base.from_core(core(load(domain, task), obs, action_repeat, image_size))
+
+
+def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core:
+    """The task as a simulation for ``base.from_core``; arguments as in ``make``."""
+    simulation = task.simulation
+    time_limit = math.ceil(round(task.time_limit / simulation.control_timestep, 6))  # in control steps
+    low, high = simulation.mj_model.actuator_ctrlrange.astype("float32").T
+    middle, half = (high + low) / 2, (high - low) / 2
+
+    if obs != "vector":
+        from ne_dreamer_jax import render
+
+        scene = render.build(simulation.mj_model, task.camera, height=image_size, width=image_size)
+
+    def reset(key: Array) -> State:
+        data, episode = task.reset(key)
+        return State(simulation.begin(data), episode, jnp.full((), time_limit, jnp.int32))
+
+    def step(state: State, action: Array) -> tuple[State, base.Progress]:
+        control = middle + half * action
+
+        def control_step(_: Array, carry: tuple[mjx.Data, Array]) -> tuple[mjx.Data, Array]:
+            data, reward = carry
+            data = simulation.advance(data, control)
+            return data, reward + task.reward(data, state.episode)
+
+        # Where the time limit is no multiple of the repeat, the last step of an episode is shorter.
+        repeat = action_repeat if time_limit % action_repeat == 0 else jnp.minimum(action_repeat, state.steps_left)
+        start = (state.physics, jnp.zeros((), jnp.float32))
+        data, reward = jax.lax.fori_loop(0, repeat, control_step, start)
+        steps_left = state.steps_left - repeat
+        sound = (jnp.abs(data.qpos) <= _MAX_VALUE).all() & (jnp.abs(data.qvel) <= _MAX_VALUE).all()
+        progress = base.Progress(reward, is_last=steps_left <= 0, is_terminal=jnp.zeros((), bool), is_sound=sound)
+        return State(data, state.episode, steps_left), progress
+
+    def observe(state: State) -> dict[str, Array]:
+        observation = {}
+        if obs != "vector":
+            overrides = task.overrides(state.episode)
+            observation["image"] = render.draw(scene, state.physics, overrides)
+        if obs != "pixels":
+            vectors = task.observe(state.physics, state.episode)
+            observation |= {name: value.astype(jnp.float32) for name, value in vectors.items()}
+        return observation
+
+    shapes: Any = jax.eval_shape(lambda key: observe(reset(key)), jax.random.key(0))
+    spec = EnvSpec(
+        observation={name: ArraySpec(value.shape, value.dtype) for name, value in shapes.items()},
+        action=ContinuousAction(simulation.mj_model.nu),
+    )
+    return base.Core(spec, reset, step, observe)

@@ -1,0 +1,117 @@
+"""What an environment is, and how a bare simulation becomes one.
+
+A ``Core`` is a simulation without bookkeeping: pure functions that start an episode, advance it and look at it.
+``from_core`` turns it into an ``Env``, adding what every environment needs: flags, auto-reset, and a guard against
+simulations that stop being finite. Everything is written for ONE environment; ``jax.vmap`` makes many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.types import Array, ContinuousAction, EnvSpec, TimeStep
+
+CoreState = Any  # a pytree of arrays, without weak types
+
+
+class Progress(NamedTuple):
+    """What one step of a simulation tells besides its new state."""
+
+    reward: Array  # float32 []
+    is_last: Array  # bool [], a time limit or a terminal state was reached
+    is_terminal: Array  # bool [], implies is_last
+    is_sound: Array  # bool [], False where the simulation broke down
+
+
+class Core(NamedTuple):
+    """A simulation as pure functions."""
+
+    spec: EnvSpec
+    reset: Callable[[Array], CoreState]  # key -> first state of an episode
+    step: Callable[[CoreState, Array], tuple[CoreState, Progress]]
+    observe: Callable[[CoreState], dict[str, Array]]  # as spec.observation; the only place where pixels are drawn
+
+
+class EnvState(NamedTuple):
+    """State of one environment. Opaque to agents; ``physics`` is for checks and plots."""
+
+    core: CoreState
+    key: Array  # typed key [], what the coming episodes are drawn from
+    needs_reset: Array  # bool [], the last time step was the last of its episode
+    faults: Array  # int32 [], episodes cut because the simulation broke down, since reset
+
+    @property
+    def physics(self) -> Any:
+        """The ``mjx.Data`` of a DMC task."""
+        return self.core.physics
+
+
+class Env(NamedTuple):
+    """An environment as pure functions, each for one environment and each jittable.
+
+    ``reset(key) -> (EnvState, TimeStep)``; ``step(state, action) -> (EnvState, TimeStep)``;
+    ``observe(state) -> obs``, the observation of the state's time step over again.
+
+    After a time step with ``is_last`` the next ``step`` ignores its action and returns the first time step of a new
+    episode (``is_first``, reward 0), started from a key never used before.
+    """
+
+    spec: EnvSpec
+    reset: Callable[[Array], tuple[EnvState, TimeStep]]
+    step: Callable[[EnvState, Array], tuple[EnvState, TimeStep]]
+    observe: Callable[[EnvState], dict[str, Array]]
+
+
+def from_core(core: Core) -> Env:
+    """Adds flags, clipping of actions, auto-reset and the guard against non-finite values to a simulation.
+
+    Where the simulation says that it broke down, or its reward or observation is not finite, the episode ends
+    there (``is_last``, not ``is_terminal``) with reward 0 and zeros for the non-finite components of the
+    observation, and ``EnvState.faults`` counts it.
+    """
+    false, true = jnp.zeros((), bool), jnp.ones((), bool)
+    nothing = Progress(reward=jnp.zeros((), jnp.float32), is_last=false, is_terminal=false, is_sound=true)
+
+    def emit(
+        state: CoreState, key: Array, faults: Array, is_first: Array, progress: Progress
+    ) -> tuple[EnvState, TimeStep]:
+        obs = core.observe(state)
+        sound = progress.is_sound & jnp.isfinite(progress.reward)
+        for value in obs.values():
+            sound &= jnp.isfinite(value).all()
+        timestep = TimeStep(
+            obs={name: jnp.where(jnp.isfinite(value), value, jnp.zeros_like(value)) for name, value in obs.items()},
+            reward=jnp.where(sound, progress.reward, nothing.reward),
+            is_first=is_first,
+            is_last=progress.is_last | ~sound,
+            is_terminal=progress.is_terminal & sound,
+        )
+        return EnvState(state, key, timestep.is_last, faults + (~sound).astype(jnp.int32)), timestep
+
+    def start(key: Array) -> tuple[CoreState, Array]:
+        key, episode_key = jax.random.split(key)
+        return core.reset(episode_key), key
+
+    def reset(key: Array) -> tuple[EnvState, TimeStep]:
+        state, key = start(key)
+        return emit(state, key, jnp.zeros((), jnp.int32), true, nothing)
+
+    def step(state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
+        if isinstance(core.spec.action, ContinuousAction):
+            action = jnp.clip(action, -1.0, 1.0)
+        simulated, progress = core.step(state.core, action)
+
+        # A loop of one turn or none rather than lax.cond: under vmap a cond would compute both sides at every step,
+        # whereas this loop is entered only when some environment of the batch starts an episode.
+        def restart(carry: tuple[Array, CoreState, Array]) -> tuple[Array, CoreState, Array]:
+            return (false, *start(carry[2]))
+
+        _, simulated, key = jax.lax.while_loop(lambda carry: carry[0], restart, (state.needs_reset, simulated, state.key))
+        progress = jax.tree.map(lambda a, b: jnp.where(state.needs_reset, a, b), nothing, progress)
+        return emit(simulated, key, state.faults, state.needs_reset, progress)
+
+    return Env(core.spec, reset, step, lambda state: core.observe(state.core))

@@ -1,0 +1,41 @@
+"""Reacher: a planar two-link arm, seen from above, whose fingertip has to stay in a ball placed at random."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.envs.dmc.common import Episode, Simulation, Task, mjx, random_joints, uniform
+from ne_dreamer_jax.envs.dmc.rewards import tolerance
+from ne_dreamer_jax.types import Array
+
+_TARGET_RADIUS = {"easy": 0.05, "hard": 0.015}
+
+
+def load(task: str) -> Task:
+    """Tasks: easy, hard. The episode is the target's place in the plane, float32 [2], in metres."""
+    simulation = Simulation.load("reacher.xml")
+    mj_model = simulation.mj_model
+    mj_model.geom("target").size[0] = _TARGET_RADIUS[task]
+    initial = simulation.initial()
+    finger = mj_model.geom("finger").id
+    touching = float(mj_model.geom("target").size[0] + mj_model.geom("finger").size[0])
+    sample_joints = random_joints(mj_model)
+
+    def reset(key: Array) -> tuple[mjx.Data, Episode]:
+        joints_key, angle_key, radius_key = jax.random.split(key, 3)
+        angle = uniform(angle_key, 0.0, 2 * math.pi)
+        radius = uniform(radius_key, 0.05, 0.20)
+        target = radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+        return initial.replace(qpos=sample_joints(joints_key)), target
+
+    def finger_to_target(data: mjx.Data, target: Array) -> Array:
+        return target - data.geom_xpos[finger, :2]
+
+    def reward(data: mjx.Data, target: Array) -> Array:
+        return tolerance(jnp.linalg.norm(finger_to_target(data, target)), (0.0, touching))
+
+    def observe(data: mjx.Data, target: Array) -> dict[str, Array]:
+        return {"position": data.qpos, "to_target": finger_to_target(data, target), "velocity": data.qvel}
+
+    return Task(simulation, 20.0, reset, reward, observe)
