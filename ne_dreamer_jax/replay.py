@@ -13,17 +13,13 @@ and no pixels travel.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax import memory
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, EnvSpec, Latent, Transition
-
-if TYPE_CHECKING:
-    from ne_dreamer_jax.agent import AgentConfig
-
 
 SHARE = 0.9
 """Of the free memory that a ring may take; the rest is for the learner."""
@@ -211,7 +207,7 @@ def check_capacity(
 
 def random_batch(
     spec: EnvSpec,
-    config: AgentConfig,
+    config: Any,
     key: Array,
     batch_size: int | None = None,
     length: int | None = None,
@@ -223,7 +219,7 @@ def random_batch(
 
     Args:
       spec: of the environment.
-      config: of the agent: ``batch_size``, ``batch_length`` and the sizes of the RSSM are read.
+      config: of the agent (``AgentConfig``): ``batch_size``, ``batch_length`` and the sizes in ``rssm`` are read.
       key: consumed.
       batch_size: B, in place of the config's.
       length: T, likewise.

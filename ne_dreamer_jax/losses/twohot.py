@@ -96,4 +96,6 @@ def twohot_loss(logits: jax.Array, target: jax.Array, bins: jax.Array) -> jax.Ar
     if logits.shape != (*target.shape, *bins.shape):
         raise ValueError(f"expected logits of shape {(*target.shape, *bins.shape)} [..., K], got {logits.shape}")
     weights = twohot_encode(jax.lax.stop_gradient(target), bins)
-    return -jnp.sum(weights * jax.nn.log_softmax(logits.astype(jnp.float32)), axis=-1)
+    logits = logits.astype(jnp.float32)
+    # The weights sum to one, so the normaliser comes out of the sum, and no array of log-probabilities is needed.
+    return jax.nn.logsumexp(logits, axis=-1) - jnp.sum(weights * logits, axis=-1)
