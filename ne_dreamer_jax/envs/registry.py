@@ -19,9 +19,7 @@ def names() -> tuple[str, ...]:
 def split_dmc(name: str) -> tuple[str, str]:
     """``"dmc/cartpole_swingup_sparse"`` -> ``("cartpole", "swingup_sparse")``."""
     check(name)
-    return next(
-        (domain, task) for domain, tasks in DMC.items() for task in tasks if name == f"dmc/{domain}_{task}"
-    )
+    return next((domain, task) for domain, tasks in DMC.items() for task in tasks if name == f"dmc/{domain}_{task}")
 
 
 def check(name: str) -> None:

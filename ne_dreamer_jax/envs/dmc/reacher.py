@@ -5,8 +5,9 @@ import math
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.envs.dmc.common import Episode, Simulation, Task, mjx, random_joints, uniform
+from ne_dreamer_jax.envs.dmc.common import Episode, Task, random_joints, uniform
 from ne_dreamer_jax.envs.dmc.rewards import tolerance
+from ne_dreamer_jax.envs.dmc.simulation import Simulation, mjx
 from ne_dreamer_jax.types import Array
 
 _TARGET_RADIUS = {"easy": 0.05, "hard": 0.015}
