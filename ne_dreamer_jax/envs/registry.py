@@ -3,8 +3,14 @@
 import difflib
 
 DMC: dict[str, tuple[str, ...]] = {
+    "acrobot": ("swingup",),
+    "ball_in_cup": ("catch",),
     "cartpole": ("balance", "balance_sparse", "swingup", "swingup_sparse"),
+    "cheetah": ("run",),
+    "finger": ("spin", "turn_easy", "turn_hard"),
+    "hopper": ("hop", "stand"),
     "pendulum": ("swingup",),
+    "quadruped": ("run", "walk"),
     "reacher": ("easy", "hard"),
     "walker": ("stand", "walk", "run"),
 }

@@ -93,8 +93,7 @@ def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core
     def observe(state: State) -> dict[str, Array]:
         observation = {}
         if obs != "vector":
-            overrides = task.overrides(state.episode)
-            observation["image"] = render.draw(scene, state.physics, overrides)
+            observation["image"] = render.draw(scene, task.pose(state.physics, state.episode))
         if obs != "pixels":
             vectors = task.observe(state.physics, state.episode)
             observation |= {name: value.astype(jnp.float32) for name, value in vectors.items()}

@@ -25,14 +25,14 @@ class Task(NamedTuple):
     reward: Callable[[mjx.Data, Episode], Array]  # float32 []
     observe: Callable[[mjx.Data, Episode], dict[str, Array]]  # dm_control's observations, float32
     camera: int = 0  # the camera whose pixels agents see
-    overrides: Callable[[Episode], Any] = lambda episode: None  # what the episode changes in the drawn scene
+    pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data  # with what the episode moves, for drawing
 
 
-def random_joints(mj_model: mujoco.MjModel) -> Callable[[Array], Array]:
-    """Returns a function ``key -> qpos``: limited joints uniform in their range, unlimited hinges in [-pi, pi).
+def random_joints(mj_model: mujoco.MjModel, unlimited: bool = True) -> Callable[[Array], Array]:
+    """Returns a function ``key -> qpos`` that draws limited joints uniformly in their range.
 
-    Unlimited slides keep their default. Equal in distribution to dm_control's
-    ``randomize_limited_and_rotational_joints``.
+    Where ``unlimited``, unlimited hinges are uniform in [-pi, pi), as in dm_control's
+    ``randomize_limited_and_rotational_joints``. All other joints keep their default.
 
     Raises:
       ValueError: the model has ball or free joints.
@@ -40,10 +40,32 @@ def random_joints(mj_model: mujoco.MjModel) -> Callable[[Array], Array]:
     hinge = mj_model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     if not (hinge | (mj_model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)).all():
         raise ValueError("expected a model with hinge and slide joints only, got one with ball or free joints")
+    around = hinge & unlimited
     limited = mj_model.jnt_limited.astype(bool)
-    low = np.where(limited, mj_model.jnt_range[:, 0], np.where(hinge, -np.pi, mj_model.qpos0))
-    high = np.where(limited, mj_model.jnt_range[:, 1], np.where(hinge, np.pi, mj_model.qpos0))
+    low = np.where(limited, mj_model.jnt_range[:, 0], np.where(around, -np.pi, mj_model.qpos0))
+    high = np.where(limited, mj_model.jnt_range[:, 1], np.where(around, np.pi, mj_model.qpos0))
     return lambda key: jax.random.uniform(key, low.shape, jnp.float32, low.astype("float32"), high.astype("float32"))
+
+
+def redraw_while_touching(
+    simulation: Simulation, sample: Callable[[Array], Array], max_attempts: int = 1000
+) -> Callable[[Array], Array]:
+    """Returns a function ``key -> qpos`` that draws from ``sample`` until no two geoms touch.
+
+    After ``max_attempts`` it gives what it has.
+    """
+    initial = simulation.initial()
+
+    def draw(key: Array) -> Array:
+        def attempt(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            key, attempts = jax.random.split(carry[0])[0], carry[1] + 1
+            qpos = sample(jax.random.split(carry[0])[1])
+            return key, attempts, qpos, simulation.in_contact(initial.replace(qpos=qpos))
+
+        start = (key, jnp.zeros((), jnp.int32), initial.qpos, jnp.ones((), bool))
+        return jax.lax.while_loop(lambda carry: carry[3] & (carry[1] < max_attempts), attempt, start)[2]
+
+    return draw
 
 
 def uniform(key: Array, low: float, high: float, shape: tuple[int, ...] = ()) -> Array:

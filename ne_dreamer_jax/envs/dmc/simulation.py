@@ -7,6 +7,7 @@ import dataclasses
 import importlib.util
 import io
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -81,7 +82,10 @@ class Simulation:
         spec = mujoco.MjSpec.from_file(str(suite_directory() / filename))
         if edit is not None:
             edit(spec)
-        mj_model = spec.compile()
+        with warnings.catch_warnings():
+            # cheetah.xml scales its masses in a way that MuJoCo discourages in new models.
+            warnings.filterwarnings("ignore", message=".*settotalmass")
+            mj_model = spec.compile()
         mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # no part in the dynamics; MJX refuses it
         if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and (mj_model.nq != mj_model.nv or mj_model.na):
             raise ValueError(f"{filename}: RK4 is implemented for hinges, slides and stateless actuators only")
@@ -94,8 +98,16 @@ class Simulation:
         return self.n_sub_steps * self.mj_model.opt.timestep
 
     def initial(self) -> mjx.Data:
-        """The model's default state, at rest; not settled."""
-        return mjx.make_data(self.mj_model)
+        """The model's default state, at rest and settled."""
+        data = mujoco.MjData(self.mj_model)
+        mujoco.mj_step1(self.mj_model, data)
+        return mjx.put_data(self.mj_model, data)
+
+    def in_contact(self, data: mjx.Data) -> Array:
+        """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
+        with _implicit_promotion():
+            contact = mjx.collision(self.model, mjx.kinematics(self.model, data))._impl.contact
+            return (contact.dist < contact.includemargin).any()
 
     def settle(self, data: mjx.Data) -> mjx.Data:
         """Brings all that depends on positions and velocities, but for sensors, up to date."""
