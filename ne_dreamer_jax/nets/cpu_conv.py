@@ -1,17 +1,16 @@
 """Convolutions and the image encoder for a CPU: matrix products over a few images at a time, with their own gradients.
 
-Everything between a chunk of images and its result stays in the cache, so that elementwise work costs little beside the
-products. Inside a chunk of n images arrays are ``[H, W, n, C]``. A 5x5 convolution goes through Winograd's transform
-(`winograd`); where channels are few, so that the transforms would cost more than they save, a stage of the encoder
-computes the 2x2 outputs that it pools together from their common 6x6 inputs instead (`_Phases`).
+Everything between the input and the result of a few images stays in the cache, so that elementwise work costs little
+beside the products. A 5x5 convolution goes through Winograd's transform (`winograd`); where channels are few, so that
+the transforms would cost more than they save, a stage of the encoder computes the 2x2 outputs that it pools together
+from their common 6x6 inputs instead (`_Phases`).
 
-The gradients are reverse mode, first order. A stage keeps its pooled output before the norm and which of the four
-outputs was the maximum; everything else is computed again.
+The gradients are reverse mode, first order. A stage of the encoder keeps its pooled output before the norm and which of
+the four pooled outputs was the maximum; everything else is computed again.
 """
 
 from __future__ import annotations
 
-import functools
 from typing import Any, Protocol
 
 import jax
@@ -22,7 +21,7 @@ from ne_dreamer_jax.nets import winograd
 from ne_dreamer_jax.nets.blocks import NORM_EPSILON
 from ne_dreamer_jax.types import Array
 
-_CHUNK = 8  # images
+_CHUNK_BYTES = 2**21
 
 
 def encodes(kernel: Array) -> bool:
@@ -31,16 +30,19 @@ def encodes(kernel: Array) -> bool:
 
 
 class _Lowering(Protocol):
-    """A 5x5 convolution followed by a 2x2 max-pool, on ``[H, W, n, C]``."""
+    """A 5x5 convolution followed by a 2x2 max-pool, for a few images ``[n, H, W, C]``."""
+
+    def bytes_per_image(self, shape: tuple[int, ...], kernel: Array) -> int:
+        """Size of the largest intermediate, for images of the given ``[N, H, W, C]``."""
 
     def prepare(self, kernel: Array) -> Array:
-        """The kernel as the products need it, once for all chunks."""
+        """The kernel as the products need it, once for all images."""
 
     def prepare_adjoint(self, u: Array, shape: tuple[int, ...]) -> Array:
         """Gradient of the kernel, of the given shape, from that of `prepare`'s result."""
 
     def forward(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """``[H, W, n, C_in]`` to the pooled ``[H / 2, W / 2, n, C_out]`` and which of four was the maximum, uint8."""
+        """``[n, H, W, C_in]`` to the pooled ``[n, H / 2, W / 2, C_out]`` and which of four was the maximum, uint8."""
 
     def backward(self, x: Array, u: Array, which: Array, g: Array) -> tuple[Array, Array]:
         """Gradients of x and u from that of the pooled output."""
@@ -56,8 +58,10 @@ class _Winograd:
     """Output tiles of 4x4 are pooled to 2x2 where they lie, before they are put back into rows."""
 
     @staticmethod
-    def prepare(kernel: Array) -> Array:
-        return winograd.transform_kernel(kernel)
+    def bytes_per_image(shape: tuple[int, ...], kernel: Array) -> int:
+        return 4 * 64 * winograd.tiles(shape[1]) * winograd.tiles(shape[2]) * max(kernel.shape[2:])
+
+    prepare = staticmethod(winograd.transform_kernel)
 
     @staticmethod
     def prepare_adjoint(u: Array, shape: tuple[int, ...]) -> Array:
@@ -65,30 +69,25 @@ class _Winograd:
 
     @staticmethod
     def forward(x: Array, u: Array) -> tuple[Array, Array]:
-        H, W, n, _ = x.shape
+        n, H, W, _ = x.shape
         T, S = winograd.tiles(H), winograd.tiles(W)
-        y = winograd.transform_output(winograd.product(winograd.transform_input(x), u))
+        y = winograd.transform_output(winograd.product(winograd.transform_input(x.transpose(1, 2, 0, 3)), u))
         y = y.reshape(2, 2, 2, 2, S, T, n, -1)  # row of the pool, row in it, column of the pool, column in it
-        pooled = _maximum_of_four([y[:, 0, :, 0], y[:, 0, :, 1], y[:, 1, :, 0], y[:, 1, :, 1]])
-        return jax.tree.map(
-            lambda z: z.transpose(3, 0, 2, 1, 4, 5).reshape(2 * T, 2 * S, n, -1)[: H // 2, : W // 2], pooled
-        )
+        top, which = _maximum_of_four([y[:, 0, :, 0], y[:, 0, :, 1], y[:, 1, :, 0], y[:, 1, :, 1]])
+        return top.transpose(4, 3, 0, 2, 1, 5).reshape(n, 2 * T, 2 * S, -1)[:, : H // 2, : W // 2], which
 
     @staticmethod
     def backward(x: Array, u: Array, which: Array, g: Array) -> tuple[Array, Array]:
-        H, W, n, _ = x.shape
+        n, H, W, _ = x.shape
         T, S = winograd.tiles(H), winograd.tiles(W)
-
-        def to_tiles(z: Array) -> Array:
-            z = jnp.pad(z, ((0, 2 * T - H // 2), (0, 2 * S - W // 2), (0, 0), (0, 0)))
-            return z.reshape(T, 2, S, 2, n, -1).transpose(1, 3, 2, 0, 4, 5)
-
-        g, which = to_tiles(g), to_tiles(which)
-        y = jnp.stack([jnp.where(which == k, g, 0.0) for k in range(4)])
-        y = y.reshape(2, 2, 2, 2, S * T * n, -1).transpose(2, 0, 3, 1, 4, 5)
+        g = jnp.pad(g, ((0, 0), (0, 2 * T - H // 2), (0, 2 * S - W // 2), (0, 0)))
+        g = g.reshape(n, T, 2, S, 2, -1).transpose(2, 4, 3, 1, 0, 5)
+        position = jnp.arange(4, dtype=jnp.uint8).reshape(1, 2, 1, 2, 1)
+        y = jnp.where(which.reshape(2, 1, 2, 1, -1) == position, g.reshape(2, 1, 2, 1, -1), 0.0)
         d = winograd.transform_output_adjoint(y.reshape(16, S * T * n, -1))
+        x = x.transpose(1, 2, 0, 3)
         dv, du = winograd.product_adjoints(winograd.transform_input(x), u, d)
-        return winograd.transform_input_adjoint(dv, x.shape), du
+        return winograd.transform_input_adjoint(dv, x.shape).transpose(2, 0, 1, 3), du
 
 
 def _phase_table() -> np.ndarray:
@@ -109,6 +108,10 @@ class _Phases:
 
     table = _phase_table()
 
+    @staticmethod
+    def bytes_per_image(shape: tuple[int, ...], kernel: Array) -> int:
+        return shape[1] * shape[2] * max(9 * kernel.shape[2], 4 * kernel.shape[3])
+
     @classmethod
     def prepare(cls, kernel: Array) -> Array:
         u = jnp.einsum("bpqi,defj,ijco->bdpecqfo", cls.table, cls.table, kernel)
@@ -121,11 +124,11 @@ class _Phases:
 
     @staticmethod
     def _patches(x: Array) -> Array:
-        """``[H, W, n, C]`` to ``[H / 2, W / 2, n, 9 * 4 * C]``: each block with its eight neighbours."""
-        H, W, n, C = x.shape
-        x = x.reshape(H // 2, 2, W // 2, 2, n, C).transpose(0, 2, 4, 1, 3, 5).reshape(H // 2, W // 2, n, 4 * C)
-        x = jnp.pad(x, ((1, 1), (1, 1), (0, 0), (0, 0)))
-        return jnp.concatenate([x[i : i + H // 2, j : j + W // 2] for i in range(3) for j in range(3)], axis=-1)
+        """``[n, H, W, C]`` to ``[n, H / 2, W / 2, 9 * 4 * C]``: each block with its eight neighbours."""
+        n, H, W, C = x.shape
+        x = x.reshape(n, H // 2, 2, W // 2, 2 * C).transpose(0, 1, 3, 2, 4).reshape(n, H // 2, W // 2, 4 * C)
+        x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        return jnp.concatenate([x[:, i : i + H // 2, j : j + W // 2] for i in range(3) for j in range(3)], axis=-1)
 
     @classmethod
     def forward(cls, x: Array, u: Array) -> tuple[Array, Array]:
@@ -136,7 +139,8 @@ class _Phases:
     @classmethod
     def backward(cls, x: Array, u: Array, which: Array, g: Array) -> tuple[Array, Array]:
         patches, adjoint = jax.vjp(cls._patches, x)
-        y = jnp.stack([jnp.where(which == k, g, 0.0) for k in range(4)], axis=3).reshape(-1, u.shape[1])
+        position = jnp.arange(4, dtype=jnp.uint8).reshape(1, 1, 1, 4, 1)
+        y = jnp.where(jnp.expand_dims(which, 3) == position, jnp.expand_dims(g, 3), 0.0).reshape(-1, u.shape[1])
         (dx,) = adjoint((y @ u.T).reshape(patches.shape))
         return dx, patches.reshape(-1, u.shape[0]).T @ y
 
@@ -145,14 +149,14 @@ def _lowering(kernel: Array) -> _Lowering:
     return _Phases if kernel.shape[2] <= 4 else _Winograd
 
 
-def _norm_silu(x: Array, scale: Array) -> Array:
-    """RMSNorm over channels and SiLU, ``[..., C]``."""
+def norm_silu(x: Array, scale: Array) -> Array:
+    """RMSNorm over channels and SiLU, ``[N, H, W, C]``."""
     inverse = jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + NORM_EPSILON)
     return jax.nn.silu(x * inverse * scale[None, None, None])
 
 
 def _norm_silu_backward(x: Array, scale: Array, g: Array) -> tuple[Array, Array]:
-    """Gradients of x and scale from that of `_norm_silu`'s result."""
+    """Gradients of x and scale from that of `norm_silu`'s result."""
     inverse = jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + NORM_EPSILON)
     unit = x * inverse
     scaled = unit * scale[None, None, None]
@@ -162,45 +166,13 @@ def _norm_silu_backward(x: Array, scale: Array, g: Array) -> tuple[Array, Array]
     return inverse * (h - unit * jnp.mean(h * unit, axis=-1, keepdims=True)), jnp.sum(g * unit, axis=(0, 1, 2))
 
 
-def _chunk_images(images: Array) -> Array:
-    """``[n, H, W, C]``, uint8 or float, to normalised ``[H, W, n, C]``."""
-    images = images.transpose(1, 2, 0, 3)
+def _images_to_float(images: Array) -> Array:
     return images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images
 
 
-def _encode_chunk(images: Array, prepared: list[tuple[Array, Array, Array]], lowerings: list[_Lowering]) -> Any:
-    x, kept = _chunk_images(images), []
-    for lowering, (u, bias, scale) in zip(lowerings, prepared, strict=True):
-        pooled, which = lowering.forward(x, u)
-        pooled = pooled + bias[None, None, None]
-        kept.append((pooled, which))
-        x = _norm_silu(pooled, scale)
-    return x.transpose(2, 0, 1, 3), kept
-
-
-def _encode_chunk_backward(
-    images: Array, prepared: list[tuple[Array, Array, Array]], lowerings: list[_Lowering], kept: Any, g: Array
-) -> Any:
-    g, gradients = g.transpose(1, 2, 0, 3), []
-    for i in reversed(range(len(prepared))):
-        u, _, scale = prepared[i]
-        pooled, which = kept[i]
-        x = _norm_silu(kept[i - 1][0], prepared[i - 1][2]) if i else _chunk_images(images)
-        g, dscale = _norm_silu_backward(pooled, scale, g)
-        dbias = jnp.sum(g, axis=(0, 1, 2))
-        g, du = lowerings[i].backward(x, u, which, g)
-        gradients.append((du, dbias, dscale))
-    return g.transpose(2, 0, 1, 3), gradients[::-1]
-
-
-def _prepare(stages: Any) -> tuple[list[tuple[Array, Array, Array]], list[_Lowering]]:
-    lowerings = [_lowering(kernel) for kernel, _, _ in stages]
-    return [(way.prepare(k), bias, scale) for way, (k, bias, scale) in zip(lowerings, stages, strict=True)], lowerings
-
-
-def _split(x: Array) -> Array:
+def _split(x: Array, bytes_per_image: int) -> Array:
     """``[N, ...]`` to ``[chunks, n, ...]``, padded with zeros by less than the number of chunks."""
-    chunks = -(-x.shape[0] // _CHUNK)
+    chunks = -(-x.shape[0] // max(1, _CHUNK_BYTES // bytes_per_image))
     n = -(-x.shape[0] // chunks)
     x = jnp.pad(x, ((0, chunks * n - x.shape[0]), *((0, 0),) * (x.ndim - 1)))
     return x.reshape(chunks, n, *x.shape[1:])
@@ -211,35 +183,59 @@ def _join(x: Array, count: int) -> Array:
 
 
 @jax.custom_vjp
+def _stage(x: Array, scale: Array | None, kernel: Array, bias: Array) -> Array:
+    """`norm_silu` where there is a scale, 5x5 convolution with bias, and 2x2 max-pool.
+
+    The stage starts where the encoder's definition has the end of the one before, so that what is kept for the gradient
+    is one array a stage, its input. uint8 images are normalised and get no gradient.
+    """
+    return _stage_forward(x, scale, kernel, bias)[0]
+
+
+def _stage_forward(x: Array, scale: Array | None, kernel: Array, bias: Array) -> tuple[Array, Any]:
+    lowering = _lowering(kernel)
+    u = lowering.prepare(kernel)
+
+    def body(chunk: Array) -> tuple[Array, Array]:
+        chunk = _images_to_float(chunk) if scale is None else norm_silu(chunk, scale)
+        top, which = lowering.forward(chunk, u)
+        return top + bias[None, None, None], which
+
+    top, which = jax.lax.map(body, _split(x, lowering.bytes_per_image(x.shape, kernel)))
+    return _join(top, x.shape[0]), (x, scale, kernel, which)
+
+
+def _stage_backward(residuals: Any, g: Array) -> Any:
+    x, scale, kernel, which = residuals
+    lowering = _lowering(kernel)
+    u = lowering.prepare(kernel)
+
+    def body(total: Any, chunk: tuple[Array, Array, Array]) -> Any:
+        x, which, g = chunk
+        active = _images_to_float(x) if scale is None else norm_silu(x, scale)
+        dx, du = lowering.backward(active, u, which, g)
+        dscale = None
+        if scale is not None:
+            dx, dscale = _norm_silu_backward(x, scale, dx)
+        gradients = dscale, du, jnp.sum(g, axis=(0, 1, 2))
+        return jax.tree.map(jnp.add, total, gradients), None if x.dtype == jnp.uint8 else dx
+
+    zero = jax.tree.map(jnp.zeros_like, (scale, u, jnp.zeros(kernel.shape[-1])))
+    size = lowering.bytes_per_image(x.shape, kernel)
+    (dscale, du, dbias), dx = jax.lax.scan(body, zero, (_split(x, size), which, _split(g, size)))
+    dkernel = lowering.prepare_adjoint(du, kernel.shape)
+    return None if dx is None else _join(dx, x.shape[0]), dscale, dkernel, dbias
+
+
+_stage.defvjp(_stage_forward, _stage_backward)
+
+
 def encode_images(images: Array, stages: Any) -> Array:
-    """`conv.encode_images` for kernels that `encodes` accepts, float32; uint8 images get no gradient."""
-    return _encode_forward(images, stages)[0]
-
-
-def _encode_forward(images: Array, stages: Any) -> tuple[Array, Any]:
-    prepared, lowerings = _prepare(stages)
-    y, kept = jax.lax.map(lambda chunk: _encode_chunk(chunk, prepared, lowerings), _split(images))
-    return _join(y, images.shape[0]), (images, stages, kept)
-
-
-def _encode_backward(residuals: Any, g: Array) -> Any:
-    images, stages, kept = residuals
-    prepared, lowerings = _prepare(stages)
-
-    def body(total: Any, chunk: Any) -> Any:
-        dx, gradients = _encode_chunk_backward(chunk[0], prepared, lowerings, chunk[1], chunk[2])
-        return jax.tree.map(jnp.add, total, gradients), None if images.dtype == jnp.uint8 else dx
-
-    zero = jax.tree.map(jnp.zeros_like, prepared)
-    gradients, dimages = jax.lax.scan(body, zero, (_split(images), kept, _split(g)))
-    dstages = tuple(
-        type(stage)(way.prepare_adjoint(du, stage[0].shape), dbias, dscale)
-        for way, stage, (du, dbias, dscale) in zip(lowerings, stages, gradients, strict=True)
-    )
-    return None if dimages is None else _join(dimages, images.shape[0]), dstages
-
-
-encode_images.defvjp(_encode_forward, _encode_backward)
+    """`conv.encode_images` for kernels that `encodes` accepts, float32."""
+    x, scale = images, None
+    for kernel, bias, next_scale in stages:
+        x, scale = _stage(x, scale, kernel, bias), next_scale
+    return norm_silu(x, scale)
 
 
 def _patches(x: Array, taps: int, before: int) -> Array:
@@ -256,6 +252,12 @@ def _flip(kernel: Array) -> Array:
 
 def _winograd_suits(kernel: Array) -> bool:
     return kernel.shape[:2] == (5, 5) and kernel.shape[2] > 4
+
+
+def _conv2d_bytes(x: Array, kernel: Array) -> int:
+    if _winograd_suits(kernel):
+        return _Winograd.bytes_per_image(x.shape, kernel)
+    return 4 * x.shape[1] * x.shape[2] * kernel.shape[0] ** 2 * max(kernel.shape[2:])
 
 
 def _convolve(x: Array, kernel: Array, before: int) -> Array:
@@ -291,7 +293,8 @@ def _convolve_backward(x: Array, kernel: Array, before: int, g: Array) -> tuple[
 def conv2d(x: Array, kernel: Array) -> Array:
     """`conv.conv2d` in float32."""
     before = (kernel.shape[0] - 1) // 2
-    return _join(jax.lax.map(lambda chunk: _convolve(chunk, kernel, before), _split(x)), x.shape[0])
+    chunks = _split(x, _conv2d_bytes(x, kernel))
+    return _join(jax.lax.map(lambda chunk: _convolve(chunk, kernel, before), chunks), x.shape[0])
 
 
 def _conv2d_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -306,7 +309,8 @@ def _conv2d_backward(residuals: tuple[Array, Array], g: Array) -> tuple[Array, A
         dx, dkernel = _convolve_backward(chunk[0], kernel, before, chunk[1])
         return total + dkernel, dx
 
-    dkernel, dx = jax.lax.scan(body, jnp.zeros_like(kernel), (_split(x), _split(g)))
+    size = _conv2d_bytes(x, kernel)
+    dkernel, dx = jax.lax.scan(body, jnp.zeros_like(kernel), (_split(x, size), _split(g, size)))
     return _join(dx, x.shape[0]), dkernel
 
 

@@ -66,6 +66,11 @@ def _window_matrix(side: int) -> np.ndarray:
     return padded[:, :, before : before + side].reshape(-1, side).astype(np.float32)
 
 
+def _over_rows(matrix: np.ndarray) -> np.ndarray:
+    """A copy of the matrix for every a: XLA transposes operands of a product whose batch axis one side lacks."""
+    return np.broadcast_to(matrix, (WINDOW, *matrix.shape))
+
+
 def transform_kernel(kernel: Array) -> Array:
     """``G k G^T``: ``[5, 5, C_in, C_out]`` to ``[64, C_in, C_out]``."""
     u = jnp.einsum("ai,bj,ijco->abco", _KERNEL_F32, _KERNEL_F32, kernel)
@@ -84,14 +89,14 @@ def transform_input(x: Array) -> Array:
     T, S = tiles(H), tiles(W)
     rows = (_window_matrix(H) @ x.reshape(H, W * n * C)).reshape(WINDOW, T, W, n * C)
     rows = rows.transpose(0, 2, 1, 3).reshape(WINDOW, W, T * n * C)
-    return jnp.einsum("bw,awm->abm", _window_matrix(W), rows).reshape(WINDOW**2, S * T * n, C)
+    return (_over_rows(_window_matrix(W)) @ rows).reshape(WINDOW**2, S * T * n, C)
 
 
 def transform_input_adjoint(v: Array, shape: tuple[int, int, int, int]) -> Array:
     """Gradient of the input, of the given ``[H, W, n, C]`` shape, from that of its transform."""
     H, W, n, C = shape
     T, S = tiles(H), tiles(W)
-    rows = jnp.einsum("bw,abm->awm", _window_matrix(W), v.reshape(WINDOW, WINDOW * S, T * n * C))
+    rows = _over_rows(_window_matrix(W).T) @ v.reshape(WINDOW, WINDOW * S, T * n * C)
     rows = rows.reshape(WINDOW, W, T, n * C).transpose(0, 2, 1, 3).reshape(WINDOW * T, W * n * C)
     return (_window_matrix(H).T @ rows).reshape(H, W, n, C)
 
