@@ -158,22 +158,26 @@ def best(found: Collection[Checkpoint]) -> Checkpoint | None:
     return max(scored, key=lambda entry: entry[:2])[2] if scored else None
 
 
-def prune(directory: Path, *, keep: int = 2, best_items: Collection[str] = ("agent",)) -> None:
-    """Removes all checkpoints but the newest, and of the best, if it is older, all items but those named.
+def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Collection[str] = ("agent",)) -> None:
+    """Removes all checkpoints but the newest, and of the best, if it is none of them, all items but those named.
 
     Args:
-      keep: how many of the newest stay whole. Two, so that damage to one costs no more than the steps in between.
-      best_items: what stays of the best, for evaluations; a run goes on from the newest.
+      whole: the items of a checkpoint from which a run can go on; only such count among the newest.
+      keep: how many of the newest stay. Two, so that damage to one costs no more than the steps in between.
+      of_best: what stays of the best, for evaluations.
     """
     found = checkpoints(directory)
     chosen = best(found)
-    for checkpoint in found[keep:]:
+    newest = [checkpoint for checkpoint in found if set(whole) <= set(checkpoint.items)][:keep]
+    for checkpoint in found:
+        if checkpoint in newest:
+            continue
         if checkpoint is not chosen:
             _discard(checkpoint.path)
             continue
-        dropped = [item for item in checkpoint.items if item not in best_items]
+        dropped = [item for item in checkpoint.items if item not in of_best]
         if dropped:
-            items = {item: leaves for item, leaves in checkpoint.items.items() if item in best_items}
+            items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}
             kept = checkpoint._replace(items=items)._asdict()
             del kept["path"]
             _write_manifest(checkpoint.path, {"format": FORMAT, **kept})
