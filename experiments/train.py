@@ -27,7 +27,9 @@ FLAGS = {  # option -> the setting that it changes
 }
 
 
-@click.command(context_settings={"max_content_width": 110})
+@click.command(
+    context_settings={"max_content_width": 110}, epilog=f"Tasks: {', '.join(envs.names())}. Settings: see --settings."
+)
 @click.option(
     "--preset",
     type=Name("preset", names.PRESETS),
@@ -38,31 +40,37 @@ FLAGS = {  # option -> the setting that it changes
 @click.option("--task", type=Name("task", envs.names()), help="What to learn, such as dmc/walker_walk.")
 @click.option("--method", type=Name("method", names.METHODS), help=f"One of {', '.join(names.METHODS)}.")
 @click.option("--size", type=Name("size", names.SIZES), help=f"Parameters, roughly: {', '.join(names.SIZES)}.")
-@click.option("--obs", type=Name("kind of observation", names.OBSERVATIONS), help="pixels, vector or both.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), help="The same seed gives the same run, to the bit.")
-@click.option("--env-steps", type=click.IntRange(1), help="Simulator steps in all, action repeat counted.")
-@click.option("--num-envs", type=click.IntRange(1), help="Environments stepped together.")
+@click.option("--obs", type=Name("observation", names.OBSERVATIONS), metavar="KIND", help="pixels, vector or both.")
 @click.option(
-    "--replay-ratio", type=click.FloatRange(0, min_open=True), help="How often each collected step is learned from."
+    "--seed", type=click.IntRange(0, 2**31 - 1), metavar="N", help="The same seed gives the same run, to the bit."
+)
+@click.option("--env-steps", type=click.IntRange(1), metavar="N", help="Simulator steps in all, action repeat counted.")
+@click.option("--num-envs", type=click.IntRange(1), metavar="N", help="Environments stepped together.")
+@click.option(
+    "--replay-ratio",
+    type=click.FloatRange(0, min_open=True),
+    metavar="X",
+    help="How often each agent step is learned from.",
 )
 @click.option(
     "--set",
     "assignments",
     metavar="PATH=VALUE",
     multiple=True,
-    help="Any other setting, such as agent.optimizer.learning_rate=1e-4; may be repeated. --settings lists them.",
+    help="Any setting, such as agent.optimizer.learning_rate=1e-4. May be repeated.",
 )
 @click.option(
     "--logdir",
     type=click.Path(path_type=Path),
     metavar="DIRECTORY",
-    help="Where the run is kept. The same command on the same directory goes on.",
+    help="Where the run is kept. The same command on the same directory goes on with it.",
 )
 @click.option(
     "--checkpoint-minutes",
     type=click.FloatRange(0),
+    metavar="X",
     default=15.0,
-    show_default=True,
+    show_default="15",
     help="Time between checkpoints; there is one at the end and on Ctrl-C besides.",
 )
 @click.option("--settings", "show", is_flag=True, help="Print all settings as PATH=VALUE and exit.")
@@ -99,7 +107,7 @@ def main(
         config = configure(preset, size, method, {FLAGS[name]: value for name, value in flags.items()}, assignments)
     if show or logdir is None:
         for path, value in settings.paths(config).items():
-            click.echo(f"{path}={value}")
+            click.echo(f"{path}={settings.as_text(value)}")
         return
     from experiments import progress, training
     from ne_dreamer_jax import checkpoint, compile_cache
