@@ -16,11 +16,13 @@ that was damaged later is passed over for the one before it.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import math
 import os
 import shutil
+import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -298,8 +300,6 @@ def _words(described: dict[str, Any] | None) -> str:
 
 
 def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
-    import orbax.checkpoint as ocp
-
     expected = _flatten(like)
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
@@ -309,16 +309,7 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
         return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
 
     stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape)}
-    read: dict[str, Any] = {}
-    if stored:
-        try:
-            with ocp.StandardCheckpointer() as checkpointer:
-                read = checkpointer.restore((checkpoint.path / item).absolute(), stored)
-        except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
-            reason = str(error).strip().splitlines()
-            raise DamagedError(
-                f"{checkpoint.path}: {item} can't be read: {type(error).__name__}: {reason[0] if reason else ''}."
-            ) from error
+    read = _read(checkpoint.path / item, stored) if stored else {}
     leaves = []
     for name, leaf in expected.items():
         saved = checkpoint.items[item][name]
@@ -327,3 +318,19 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
             raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")
         leaves.append(jax.random.wrap_key_data(array, impl=saved["impl"]) if _is_key(leaf) else array)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
+    import orbax.checkpoint as ocp
+
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            return checkpointer.restore(path.absolute(), like)
+    except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        reason = f"{path} can't be read: {type(error).__name__}: {first_line[:200]}."
+    # What Orbax had begun is dropped here and now, since Python warns of it whenever that happens.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+        gc.collect()
+    raise DamagedError(reason)
