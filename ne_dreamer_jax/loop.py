@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ne_dreamer_jax import replay as replay_lib
 from ne_dreamer_jax.types import Array, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
@@ -43,6 +44,8 @@ class LoopConfig:
     """Episodes of an evaluation, on environments of their own."""
     write_latents: bool = True
     """Whether the posterior latents of an update replace those in replay."""
+    latent_dtype: Literal["float32", "bfloat16"] = "float32"
+    """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
 
 
 class Counters(NamedTuple):
@@ -130,9 +133,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
 
         return jax.eval_shape(build, jax.random.key(0))
 
-    shapes = example()
-    replay_bytes = replay_lib.nbytes(shapes, capacity)
-    replay_lib.check_capacity(shapes, capacity)
+    shapes, latent_dtype = example(), jnp.dtype(config.latent_dtype)
+    replay_lib.check_capacity(shapes, capacity, n, latent_dtype)
 
     def init(key: Array) -> LoopState:
         agent_key, env_key, key = jax.random.split(key, 3)
@@ -142,7 +144,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
             env=env_state,
             timestep=timestep,
             policy=agent.init_policy(n),
-            replay=replay_lib.init(shapes, capacity, n),
+            replay=replay_lib.init(shapes, capacity, n, latent_dtype),
             episodes=Episodes(jnp.zeros((n,)), jnp.zeros((n,), jnp.int32)),
             counters=Counters(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)),
             key=key,
@@ -237,13 +239,17 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
                 clips.append(images[counts])
         video = None
         if clips:
-            import numpy as np
-
             video = np.concatenate(clips)
         return Evaluation(carry[4], carry[5], video)
 
     return Loop(
-        init, jax.jit(chunk, donate_argnums=0), evaluate, replay_bytes, capacity, vector_steps, updates
+        init=init,
+        chunk=jax.jit(chunk, donate_argnums=0),
+        evaluate=evaluate,
+        replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
+        capacity=capacity,
+        vector_steps=vector_steps,
+        updates=updates,
     )
 
 
