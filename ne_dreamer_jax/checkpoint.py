@@ -16,11 +16,13 @@ that was damaged later is passed over for the one before it.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import math
 import os
 import shutil
+import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -158,22 +160,26 @@ def best(found: Collection[Checkpoint]) -> Checkpoint | None:
     return max(scored, key=lambda entry: entry[:2])[2] if scored else None
 
 
-def prune(directory: Path, *, keep: int = 2, best_items: Collection[str] = ("agent",)) -> None:
-    """Removes all checkpoints but the newest, and of the best, if it is older, all items but those named.
+def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Collection[str] = ("agent",)) -> None:
+    """Removes all checkpoints but the newest, and of the best, if it is none of them, all items but those named.
 
     Args:
-      keep: how many of the newest stay whole. Two, so that damage to one costs no more than the steps in between.
-      best_items: what stays of the best, for evaluations; a run goes on from the newest.
+      whole: the items of a checkpoint from which a run can go on; only such count among the newest.
+      keep: how many of the newest stay. Two, so that damage to one costs no more than the steps in between.
+      of_best: what stays of the best, for evaluations.
     """
     found = checkpoints(directory)
     chosen = best(found)
-    for checkpoint in found[keep:]:
+    newest = [checkpoint for checkpoint in found if set(whole) <= set(checkpoint.items)][:keep]
+    for checkpoint in found:
+        if checkpoint in newest:
+            continue
         if checkpoint is not chosen:
             _discard(checkpoint.path)
             continue
-        dropped = [item for item in checkpoint.items if item not in best_items]
+        dropped = [item for item in checkpoint.items if item not in of_best]
         if dropped:
-            items = {item: leaves for item, leaves in checkpoint.items.items() if item in best_items}
+            items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}
             kept = checkpoint._replace(items=items)._asdict()
             del kept["path"]
             _write_manifest(checkpoint.path, {"format": FORMAT, **kept})
@@ -294,8 +300,6 @@ def _words(described: dict[str, Any] | None) -> str:
 
 
 def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
-    import orbax.checkpoint as ocp
-
     expected = _flatten(like)
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
@@ -305,16 +309,7 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
         return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
 
     stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape)}
-    read: dict[str, Any] = {}
-    if stored:
-        try:
-            with ocp.StandardCheckpointer() as checkpointer:
-                read = checkpointer.restore((checkpoint.path / item).absolute(), stored)
-        except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
-            reason = str(error).strip().splitlines()
-            raise DamagedError(
-                f"{checkpoint.path}: {item} can't be read: {type(error).__name__}: {reason[0] if reason else ''}."
-            ) from error
+    read = _read(checkpoint.path / item, stored) if stored else {}
     leaves = []
     for name, leaf in expected.items():
         saved = checkpoint.items[item][name]
@@ -323,3 +318,19 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
             raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")
         leaves.append(jax.random.wrap_key_data(array, impl=saved["impl"]) if _is_key(leaf) else array)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
+    import orbax.checkpoint as ocp
+
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            return checkpointer.restore(path.absolute(), like)
+    except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        reason = f"{path} can't be read: {type(error).__name__}: {first_line[:200]}."
+    # What Orbax had begun is dropped here and now, since Python warns of it whenever that happens.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+        gc.collect()
+    raise DamagedError(reason)

@@ -93,6 +93,23 @@ def check(path: Path) -> None:
         )
 
 
+def check_same(path: Path, config: Any) -> None:
+    """Refuses a directory that holds a run of another configuration; touches nothing.
+
+    Raises:
+      RefusedError: what differs, one line each.
+    """
+    if not RunDirectory(path).config.exists():
+        return
+    different = settings.differences(read_config(path, type(config)), config)
+    if different:
+        shown = [*different[:8], *([f"and {len(different) - 8} more"] if len(different) > 8 else [])]
+        raise RefusedError(
+            f"{path} holds another run. Give it the same options to go on, or choose another --logdir. "
+            "They differ in\n  " + "\n  ".join(shown)
+        )
+
+
 @contextlib.contextmanager
 def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
     """Holds a run directory for training, made if need be; nobody else gets it meanwhile.
@@ -115,9 +132,8 @@ def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
             fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RefusedError(f"another process trains in {path}. Wait for it, or choose another --logdir") from None
-        if files.config.exists():
-            _check_same(files, config)
-        else:
+        check_same(path, config)
+        if not files.config.exists():
             marker.write(_MARKER_TEXT)
             marker.flush()
             _write_json(files.config, settings.to_dict(config))
@@ -144,16 +160,6 @@ def read_config(path: Path, cls: type[C]) -> C:
 def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:
     """Stores what an evaluation found, in place of the one before."""
     _write_json(files.evaluation, result)
-
-
-def _check_same(files: RunDirectory, config: Any) -> None:
-    different = settings.differences(read_config(files.path, type(config)), config)
-    if different:
-        shown = [*different[:8], *([f"and {len(different) - 8} more"] if len(different) > 8 else [])]
-        raise RefusedError(
-            f"{files.path} holds another run. Give it the same options to go on, or choose another --logdir. "
-            "They differ in\n  " + "\n  ".join(shown)
-        )
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -90,12 +90,21 @@ def test_newest_first_and_best_by_score(tmp_path):
 def test_pruning_keeps_the_newest_whole_and_the_agent_of_the_best(tmp_path):
     for step, score in [(1, 5.0), (2, 9.0), (3, 1.0), (4, None), (5, 2.0)]:
         save(tmp_path, step, score)
-        checkpoint.prune(tmp_path)
+        checkpoint.prune(tmp_path, whole=("agent", "loop"))
     kept = {found.step: (set(found.items), found.score) for found in checkpoint.checkpoints(tmp_path)}
     assert kept == {5: ({"agent", "loop"}, 2.0), 4: ({"agent", "loop"}, None), 2: ({"agent"}, 9.0)}
     assert sorted(os.listdir(tmp_path / f"{2:012d}")) == ["agent", "manifest.json"]
     assert checkpoint.restore(tmp_path, {"agent": make().params}, prefer="best").checkpoint.step == 2
     assert checkpoint.restore(tmp_path, LIKE, prefer="best").checkpoint.step == 5  # the best that has both items
+
+
+def test_pruning_counts_only_checkpoints_from_which_a_run_can_go_on(tmp_path):
+    save(tmp_path, 1)
+    for step, score in [(2, 3.0), (3, 1.0)]:
+        checkpoint.save(tmp_path, step, {"agent": make(step).params}, score=score)
+        checkpoint.prune(tmp_path, whole=("agent", "loop"), keep=1)
+    assert [found.step for found in checkpoint.checkpoints(tmp_path)] == [2, 1]
+    assert checkpoint.restore(tmp_path, LIKE).checkpoint.step == 1
 
 
 def flip(path):
