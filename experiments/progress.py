@@ -27,7 +27,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     device = jax.devices()[0]
     return [
         f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, "
-        f"on {device.platform} ({device.device_kind})",
+        f"on {'the CPU' if device.platform == 'cpu' else device.device_kind}",
         f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps in "
         f"{schedule.num_envs} environments, each held for {schedule.action_repeat} environment steps",
         f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, after "

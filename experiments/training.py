@@ -24,6 +24,7 @@ from ne_dreamer_jax import checkpoint, compile_cache, metrics
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.agent import Agent, parameter_counts
 from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState
 from ne_dreamer_jax.metrics import Counters
 from ne_dreamer_jax.run_directory import RunDirectory
@@ -41,14 +42,17 @@ class Run(NamedTuple):
     shapes: LoopState  # shapes and dtypes of the whole state
 
 
-def build(config: Config) -> Run:
+def build(config: Config, env: Env | None = None) -> Run:
     """Makes the environment, the agent and the loop of a configuration; allocates nothing.
+
+    Args:
+      env: what to train in, instead of the environment that the configuration names.
 
     Raises:
       ValueError: what does not fit together, or not into memory.
     """
     options = config.env
-    env = nedreamer.envs.make(
+    env = env or nedreamer.envs.make(
         options.task, obs=options.obs, action_repeat=options.action_repeat, image_size=options.image_size
     )
     agent = nedreamer.make_agent(config.agent, env.spec)
@@ -85,8 +89,9 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
                 values, frames = evaluate(run, state, evaluation_key, record.random_return is None, echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
-                saves.if_best(state, counters, values["eval/return"])
                 draw(run, files, record)
+                if step < schedule.total:  # at the end everything is saved below
+                    saves.if_best(state, counters, values["eval/return"])
             if step == schedule.total or stop.signal is not None:
                 break
             if chunk is None:
@@ -116,19 +121,23 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     return 0
 
 
-def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo) -> tuple[dict[str, float], Any]:
+def evaluate(
+    run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo
+) -> tuple[dict[str, float], Any]:
     """Metrics of an evaluation on environments of its own, and the frames of one of its episodes.
 
     Args:
       key: of the run's evaluations; every step has its own episodes.
       with_random: whether to evaluate a random policy too.
     """
-    began = time.perf_counter()
     policy_key, random_key = jax.random.split(jax.random.fold_in(key, state.counters.vector_step))
-    evaluation = run.loop.evaluate(state.train.params, policy_key, frames=True)
-    values = _returns(evaluation, "eval/")
+    values = {}
     if with_random:
+        echo("Compiling the evaluation, and playing episodes with a random policy.")
         values |= _returns(run.loop.evaluate(state.train.params, random_key, random=True, frames=True), "eval/random_")
+    began = time.perf_counter()
+    evaluation = run.loop.evaluate(state.train.params, policy_key, frames=True)
+    values |= _returns(evaluation, "eval/")
     values["time/evaluation_seconds"] = seconds = time.perf_counter() - began
     echo(
         f"Evaluation: return {values['eval/return']:.1f} ± {values['eval/return_std']:.1f} over "

@@ -17,7 +17,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
-from ne_dreamer_jax.objectives import NextEmbedding, ObjectiveConfig, Sizes
+from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding, Sizes
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import (
     Array,
@@ -52,7 +52,7 @@ class AgentConfig:
     rssm: RSSMConfig = field(default_factory=RSSMConfig)
     heads: HeadsConfig = field(default_factory=HeadsConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
-    objective: ObjectiveConfig = field(default_factory=NextEmbedding)
+    objective: AnyObjective = field(default_factory=NextEmbedding)
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     loss_scales: Mapping[str, float] = field(default_factory=lambda: {**BASE_LOSS_SCALES, "next_embedding": 1.0})
