@@ -151,7 +151,9 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         rate = config.behavior.slow_rate
         new = TrainState(
             params=params,
-            slow_critic=jax.tree.map(lambda slow, fast: slow + rate * (fast - slow), state.slow_critic, params["critic"]),
+            slow_critic=jax.tree.map(
+                lambda slow, fast: slow + rate * (fast - slow), state.slow_critic, params["critic"]
+            ),
             target=objective.after_update(params, state.target, update),
             optimizer=optimizer_state,
             return_scale=scale,

@@ -7,7 +7,7 @@ the continuation of state t + 1 were received on arrival at it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,8 +76,8 @@ def imagine(nets: Networks, params: Params, key: Array, start: Latent, horizon: 
         raw = policy(nets.heads, nets.spec.action, nets.apply("actor", params, state)).sample(action_key)
         uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
         action = model_action(nets.spec.action, raw)
-        latent = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
-        return latent, (state, raw)
+        after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
+        return after, (state, raw)
 
     last, (states, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
     return Trajectory(jnp.concatenate([states, feature(last)[None]]), actions)

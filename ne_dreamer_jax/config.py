@@ -121,7 +121,10 @@ def with_method(config: Config, method: str) -> Config:
 _full = objectives.NextEmbedding()
 METHODS: dict[str, tuple[Any, dict[str, float]]] = {
     "ne_dreamer": (_full, {"next_embedding": 1.0}),
-    "ne_dreamer/no_transformer": (replace(_full, predictor=replace(_full.predictor, layers=0)), {"next_embedding": 1.0}),
+    "ne_dreamer/no_transformer": (
+        replace(_full, predictor=replace(_full.predictor, layers=0)),
+        {"next_embedding": 1.0},
+    ),
     "ne_dreamer/no_shift": (replace(_full, shift=0), {"next_embedding": 1.0}),
     "ne_dreamer/no_projector": (
         replace(_full, predictor=replace(_full.predictor, projector=False)),

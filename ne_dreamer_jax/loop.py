@@ -91,7 +91,7 @@ class Loop(NamedTuple):
     chunk: Callable[[LoopState, Array], tuple[LoopState, Metrics]]
     """(state, vector steps int32 []) -> new state and metrics. Jitted; donates the state."""
     evaluate: Callable[..., Evaluation]
-    """(params, key, episodes, random=False, frames=False) -> returns of the mode of the policy, or of random actions."""
+    """(params, key, episodes, random=False, frames=False) -> returns of the policy's mode, or of random actions."""
     replay_bytes: int
     """What replay will allocate."""
     capacity: int

@@ -7,6 +7,7 @@ DreamerV3's two-sided KL).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,9 +35,7 @@ def posterior_rollout(nets: Networks, params: Params, key: Array, batch: Batch) 
     """Encodes a batch and unrolls the posterior along it: the rollout, and the posterior's logits [B, T, S, K]."""
     action, prev_action = (encode_action(nets.spec.action, a) for a in (batch.action, batch.prev_action))
     embedding = nets.apply("encoder", params, batch.obs)
-    latent, logits = observe(
-        nets.rssm, params["rssm"], key, batch.context, embedding, prev_action, batch.is_first
-    )
+    latent, logits = observe(nets.rssm, params["rssm"], key, batch.context, embedding, prev_action, batch.is_first)
     return Rollout(batch, embedding, latent, feature(latent), action, prev_action), logits
 
 
@@ -54,7 +53,7 @@ def posterior_step(nets: Networks, params: Params, key: Array, policy: PolicySta
 
 
 def binary_cross_entropy(logit: Array, target: Array) -> Array:
-    """``-(y log p + (1 - y) log(1 - p))`` with p = sigmoid(logit), elementwise; the target may be any number in [0, 1]."""
+    """``-(y log p + (1 - y) log(1 - p))`` with p = sigmoid(logit) and any target y in [0, 1], elementwise."""
     return -(target * jax.nn.log_sigmoid(logit) + (1 - target) * jax.nn.log_sigmoid(-logit))
 
 
@@ -65,7 +64,7 @@ def prediction_losses(
 
     The continuation's target is ``discount * (1 - is_terminal)``: the head's probability contains the discount.
     """
-    prior = nets.rssm.apply({"params": params["rssm"]}, rollout.latent.deter, method=RSSM.prior)
+    prior: Any = nets.rssm.apply({"params": params["rssm"]}, rollout.latent.deter, method=RSSM.prior)
     dynamics, representation = balanced_kl(posterior, prior, config.free_nats, config.kl_unimix)
     bins = symexp_bins(nets.heads.bins)
     reward = twohot_loss(nets.apply("reward", params, rollout.feature), rollout.batch.reward, bins)

@@ -54,6 +54,12 @@ def _maximum_of_four(y: list[Array]) -> tuple[Array, Array]:
     return top, which.astype(jnp.uint8)
 
 
+def _where_maximum(which: Array, four: tuple[int, ...], g: Array) -> Array:
+    """g at the one of four positions, counted along the axes of shape ``four``, that was the maximum; zero elsewhere."""
+    # Compared as floats: LLVM vectorises that, and not the comparison of integers.
+    return jnp.where(which.astype(jnp.float32) == jnp.arange(4.0).reshape(four), g, 0.0)
+
+
 class _Winograd:
     """Output tiles of 4x4 are pooled to 2x2 where they lie, before they are put back into rows."""
 
@@ -82,8 +88,7 @@ class _Winograd:
         T, S = winograd.tiles(H), winograd.tiles(W)
         g = jnp.pad(g, ((0, 0), (0, 2 * T - H // 2), (0, 2 * S - W // 2), (0, 0)))
         g = g.reshape(n, T, 2, S, 2, -1).transpose(2, 4, 3, 1, 0, 5)
-        position = jnp.arange(4, dtype=jnp.uint8).reshape(1, 2, 1, 2, 1)
-        y = jnp.where(which.reshape(2, 1, 2, 1, -1) == position, g.reshape(2, 1, 2, 1, -1), 0.0)
+        y = _where_maximum(which.reshape(2, 1, 2, 1, -1), (1, 2, 1, 2, 1), g.reshape(2, 1, 2, 1, -1))
         d = winograd.transform_output_adjoint(y.reshape(16, S * T * n, -1))
         x = x.transpose(1, 2, 0, 3)
         dv, du = winograd.product_adjoints(winograd.transform_input(x), u, d)
@@ -139,8 +144,7 @@ class _Phases:
     @classmethod
     def backward(cls, x: Array, u: Array, which: Array, g: Array) -> tuple[Array, Array]:
         patches, adjoint = jax.vjp(cls._patches, x)
-        position = jnp.arange(4, dtype=jnp.uint8).reshape(1, 1, 1, 4, 1)
-        y = jnp.where(jnp.expand_dims(which, 3) == position, jnp.expand_dims(g, 3), 0.0).reshape(-1, u.shape[1])
+        y = _where_maximum(jnp.expand_dims(which, 3), (1, 1, 1, 4, 1), jnp.expand_dims(g, 3)).reshape(-1, u.shape[1])
         (dx,) = adjoint((y @ u.T).reshape(patches.shape))
         return dx, patches.reshape(-1, u.shape[0]).T @ y
 

@@ -58,9 +58,15 @@ class Networks:
 
     def init(self, key: Array) -> dict[str, Params]:
         """Fresh parameters by name: encoder, rssm, reward, continue, actor, critic."""
-        keys = dict(zip(("encoder", "rssm", "reward", "continue", "actor", "critic"), jax.random.split(key, 6)))
+        keys = dict(
+            zip(("encoder", "rssm", "reward", "continue", "actor", "critic"), jax.random.split(key, 6), strict=True)
+        )
         obs = {name: jnp.zeros((1, *s.shape), s.dtype) for name, s in self.spec.observation.items()}
-        step = (initial_latent(self.rssm.config, (1,)), jnp.zeros((1, self.embedding)), jnp.zeros((1, self.rssm.action)))
+        step = (
+            initial_latent(self.rssm.config, (1,)),
+            jnp.zeros((1, self.embedding)),
+            jnp.zeros((1, self.rssm.action)),
+        )
         inputs: Mapping[str, tuple[nn.Module, tuple[Any, ...]]] = {
             "encoder": (self.encoder, (obs,)),
             "rssm": (self.rssm, step),

@@ -96,10 +96,7 @@ class Predictor(nn.Module):
         else:
             act = Linear(c.width, dtype=dtype, name="action_in")(action)
             act = nn.gelu(LayerNorm(dtype, name="action_norm")(act), approximate=False)
-        if c.layers == 0:
-            x = state + act
-        else:
-            x = self._attend(state, act, is_first)
+        x = state + act if c.layers == 0 else self._attend(state, act, is_first)
         x = Linear(c.width, dtype=dtype, name="hidden")(LayerNorm(dtype, name="out_norm")(x))
         x = Linear(self.embedding, dtype=dtype, name="out")(nn.gelu(x, approximate=False))
         return x.astype(jnp.float32)

@@ -148,7 +148,7 @@ class RSSM(nn.Module):
         return self._logits(self.prior_out(self.prior_mlp(deter)))
 
     def posterior(self, deter: Array, observation_in: Array) -> Array:
-        """Logits of ``q(z_t | h_t, e_t)`` from h_t and ``embed_observation(e_t)``: float32 [..., S, K], not yet mixed."""
+        """Logits of ``q(z_t | h_t, e_t)`` from h_t and ``embed_observation(e_t)``: float32 [..., S, K], not mixed."""
         product = deter.astype(self.dtype) @ self.posterior_kernel[: self.config.deter].astype(self.dtype)
         return self._logits(self.posterior_out(nn.silu(self.posterior_norm(product + observation_in))))
 

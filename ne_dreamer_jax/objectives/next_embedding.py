@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 
@@ -53,7 +53,7 @@ class NextEmbedding:
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
             action = rollout.action if self.action == "current" else rollout.prev_action
             is_first = rollout.batch.is_first
-            predicted = predictor.apply({"params": params["objective"]}, rollout.feature, action, is_first)
+            predicted: Any = predictor.apply({"params": params["objective"]}, rollout.feature, action, is_first)
             value, metrics = next_embedding_loss(
                 predicted, rollout.embedding, is_first, self.redundancy, self.shift, self.masked
             )

@@ -99,9 +99,11 @@ def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core
             observation |= {name: value.astype(jnp.float32) for name, value in vectors.items()}
         return observation
 
-    shapes: Any = jax.eval_shape(lambda key: observe(reset(key)), jax.random.key(0))
-    spec = EnvSpec(
-        observation={name: ArraySpec(value.shape, value.dtype) for name, value in shapes.items()},
-        action=ContinuousAction(simulation.mj_model.nu),
-    )
+    shapes = {}
+    if obs != "vector":
+        shapes["image"] = ArraySpec((image_size, image_size, 3), jnp.uint8)
+    if obs != "pixels":
+        vectors: Any = jax.eval_shape(task.observe, simulation.initial(), task.episode)
+        shapes |= {name: ArraySpec(value.shape, jnp.float32) for name, value in vectors.items()}
+    spec = EnvSpec(shapes, ContinuousAction(simulation.mj_model.nu))
     return base.Core(spec, reset, step, observe)

@@ -24,6 +24,7 @@ class Task(NamedTuple):
     reset: Callable[[Array], tuple[mjx.Data, Episode]]  # key -> the first state, not settled
     reward: Callable[[mjx.Data, Episode], Array]  # float32 []
     observe: Callable[[mjx.Data, Episode], dict[str, Array]]  # dm_control's observations, float32
+    episode: Episode = ()  # an example, for shapes
     camera: int = 0  # the camera whose pixels agents see
     pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data  # with what the episode moves, for drawing
 

@@ -46,4 +46,4 @@ def load(task: str) -> Task:
     def pose(data: mjx.Data, target: Array) -> mjx.Data:
         return data.replace(geom_xpos=data.geom_xpos.at[ball, :2].set(target))
 
-    return Task(simulation, 20.0, reset, reward, observe, pose=pose)
+    return Task(simulation, 20.0, reset, reward, observe, jnp.zeros(2), pose=pose)
