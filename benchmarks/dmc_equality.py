@@ -37,7 +37,7 @@ class Recording(NamedTuple):
 
     start: Arrays  # [K, ...], the integrated fields of MuJoCo's data before each step
     end: Arrays  # [K, ...], and what else rewards and observations are made of, after it
-    action: np.ndarray  # float32 [K, A], in [-1, 1]
+    action: np.ndarray  # [K, A], in [-1, 1]
     episode: Episode  # [K, ...], what the episode drew besides its state
     reward: np.ndarray  # [K]
     obs: Arrays  # [K, ...]
@@ -89,7 +89,7 @@ def record(name: str, num_steps: int, seed: int = 0, action_repeat: int = 2, res
             reward += timestep.reward
         obs = {key: np.array(value) for key, value in timestep.observation.items()}
         rows.append(Recording(start, fields(data, _INTEGRATED + _DERIVED), action, episode, reward, obs))
-    return jax.tree.map(lambda *values: np.stack(values).astype(np.float32), *rows)
+    return jax.tree.map(lambda *values: np.stack(values).astype(np.float64), *rows)
 
 
 class Player:
@@ -99,13 +99,14 @@ class Player:
         self.task = task
         self._advance = jax.jit(jax.vmap(task.simulation.advance))
         self._read = jax.jit(jax.vmap(lambda data, episode: (task.reward(data, episode), task.observe(data, episode))))
-        self._low, self._high = task.simulation.mj_model.actuator_ctrlrange.astype(np.float32).T
+        self._low, self._high = task.simulation.mj_model.actuator_ctrlrange.T
 
     def place(self, start: Arrays) -> Any:
         """``mjx.Data`` [K], settled at the given states."""
         count = len(start["time"])
         blank = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), self.task.simulation.initial())
-        return self._advance(blank, jnp.zeros((count, len(self._low))), jnp.ones(count, bool), start)
+        control = jnp.zeros((count, len(self._low)), blank.ctrl.dtype)
+        return self._advance(blank, control, jnp.ones(count, bool), start)
 
     def read(self, data: Any, episode: Episode) -> tuple[np.ndarray, Arrays]:
         """Reward [K] and observation [K, ...] of ``mjx.Data`` [K]."""
@@ -115,10 +116,11 @@ class Player:
         self, start: Arrays, episode: Episode, actions: np.ndarray, action_repeat: int = 2
     ) -> tuple[np.ndarray, Arrays]:
         """Rewards [T, K] and observations [T, K, ...] of actions [T, K, A] from states [K]."""
+        start, episode = jax.tree.map(jnp.asarray, (start, episode))
         data, never = self.place(start), jnp.zeros(len(start["time"]), bool)
         rewards, observations = [], []
         for action in actions:
-            control = jnp.asarray((self._low + self._high) / 2 + (self._high - self._low) / 2 * action)
+            control = jnp.asarray((self._low + self._high) / 2 + (self._high - self._low) / 2 * action, data.ctrl.dtype)
             total = np.zeros(len(never))
             for _ in range(action_repeat):
                 data = self._advance(data, control, never, start)
@@ -293,15 +295,21 @@ HEADER = """\
 
 @click.command(help=__doc__, context_settings={"show_default": True})
 @click.option("--task", "tasks", multiple=True, help="A name such as dmc/walker_walk; may be repeated. Default: all.")
+@click.option(
+    "--float64", is_flag=True, help="Compute ours in 64 bits: what then is left of the errors isn't rounding."
+)
 @click.option("--steps", default=500, help="Steps that each start from dm_control's state.")
 @click.option("--free-steps", default=500, help="Steps of a free run; 0 skips it.")
 @click.option("--runs", default=5, help="Free runs.")
 @click.option("--resets", default=1000, help="Resets in each; 0 skips them.")
 @click.option("--episodes", default=100, help="Episodes of the random policy in each; 0 skips them.")
-def main(tasks: tuple[str, ...], steps: int, free_steps: int, runs: int, resets: int, episodes: int) -> None:
+def main(
+    tasks: tuple[str, ...], float64: bool, steps: int, free_steps: int, runs: int, resets: int, episodes: int
+) -> None:
     """Prints the table, one row as soon as it is measured."""
     for name in tasks:
         registry.check(name)
+    jax.config.update("jax_enable_x64", float64)
     click.echo(HEADER)
     for name in tasks or [name for name in registry.names() if name.startswith("dmc/")]:
         click.echo(format_row(measure(name, steps, free_steps, runs, resets, episodes)))
