@@ -122,7 +122,7 @@ class Batch(NamedTuple):
     is_last: Array  # bool [B, T]
     is_terminal: Array  # bool [B, T]
     context: Latent  # [B, ...], the replayed latent one step before obs[:, 0]; ignored where is_first[:, 0]
-    index: Array  # int32 [B, T], where the steps lie in replay, for write_latents
+    index: Array  # type: ignore[assignment]  # int32 [B, T], where the steps lie in replay (hides tuple.index)
 
 
 class Rollout(NamedTuple):
