@@ -28,11 +28,10 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     return [
         f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, "
         f"on {'the CPU' if device.platform == 'cpu' else device.device_kind}",
-        f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps in "
-        f"{schedule.num_envs} environments, each held for {schedule.action_repeat} environment steps",
-        f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, after "
-        f"{options.prefill:,} agent steps; each agent step is learned from "
-        f"{options.replay_ratio:g} times (replay ratio)",
+        f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
+        f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
+        f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
+        f"{options.prefill:,} agent steps; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
         f"  memory    replay holds {loop.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]

@@ -121,9 +121,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     return 0
 
 
-def evaluate(
-    run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo
-) -> tuple[dict[str, float], Any]:
+def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo) -> tuple[dict[str, float], Any]:
     """Metrics of an evaluation on environments of its own, and the frames of one of its episodes.
 
     Args:

@@ -160,7 +160,7 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
             key=key,
             update=update,
         )
-        metrics["gradient_norm"] = optax.global_norm(grads)
+        metrics["gradient_norm"] = optax.tree.norm(grads)
         return new, jax.lax.stop_gradient(latent), metrics
 
     return Agent(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -66,6 +67,7 @@ def env() -> base.Env:
     )
 
 
-def run(**loop) -> training.Run:
-    """The toy configuration in the toy world."""
-    return training.build(config(**loop), env())
+@functools.cache
+def run() -> training.Run:
+    """The toy configuration in the toy world, compiled once."""
+    return training.build(config(), env())
