@@ -135,7 +135,9 @@ class Simulation:
 
         def move(data: mjx.Data) -> mjx.Data:
             moved = jax.tree.map(lambda new, old: jnp.where(restart, new, old), start, integrated(data))
-            return self.settle(data.replace(**moved))
+            settled = self.settle(data.replace(**moved))
+            # In 64-bit mode MJX returns some integers wider than it takes them; a loop's carry has to keep its types.
+            return jax.tree.map(lambda new, old: new.astype(old.dtype), settled, data)
 
         def euler(_: Array, data: mjx.Data) -> mjx.Data:
             data = self._accelerate(data, passive=restart)
