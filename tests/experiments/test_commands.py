@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from experiments import evaluate, train, training
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import envs, names, run_directory, settings
-from tests.experiments import toy
+from tests.experiments import stub
 
 
 def invoke(command, *arguments):
@@ -133,30 +133,31 @@ def test_settings_are_printed_as_they_are_taken():
 
 
 @pytest.fixture(scope="module")
-def toy_run(tmp_path_factory):
+def trained(tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
-    run = toy.run()
+    run = stub.run()
     with run_directory.claim(path, run.config) as files:
         training.train(run, files, echo=lambda line: None)
     return path
 
 
 @pytest.mark.parametrize("which", ["best", "newest"])
-def test_evaluate_plays_a_stored_policy_beside_a_random_one(toy_run, monkeypatch, which):
-    build = training.build
-    monkeypatch.setattr(training, "build", lambda config: build(config, toy.env()))
-    code, output = invoke(evaluate, toy_run, "--episodes", 3, "--video", "--checkpoint", which)
+def test_evaluate_plays_a_stored_policy_beside_a_random_one(trained, monkeypatch, which):
+    monkeypatch.setattr(training, "build", stub.build)
+    code, output = invoke(evaluate, trained, "--episodes", 3, "--video", "--checkpoint", which)
     assert code == 0
     assert "policy return" in output
     assert "random return" in output
-    assert "no video: this agent sees vectors" in output
-    result = json.loads((toy_run / "evaluation.json").read_text())
+    assert "policy.mp4 shows the first episode" in output
+    result = json.loads((trained / "evaluation.json").read_text())
     assert len(result["policy"]["returns"]) == len(result["random"]["returns"]) == result["episodes"] == 3
     np.testing.assert_allclose(result["policy"]["mean"], np.mean(result["policy"]["returns"]))
     assert result["policy"]["returns"] != result["random"]["returns"]
-    first = (toy_run / "evaluation.json").read_text()
-    invoke(evaluate, toy_run, "--episodes", 3, "--checkpoint", which)
-    assert (toy_run / "evaluation.json").read_text() == first  # the same seed, the same episodes
+    first = (trained / "evaluation.json").read_text()
+    monkeypatch.setattr(training, "build", lambda config: stub.build(config, image=False))
+    _, output = invoke(evaluate, trained, "--episodes", 3, "--video", "--checkpoint", which)
+    assert "no video: this agent sees vectors" in output
+    assert (trained / "evaluation.json").read_text() == first  # the same seed, the same episodes
 
 
 @pytest.mark.slow

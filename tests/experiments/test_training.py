@@ -9,7 +9,7 @@ import pytest
 
 from experiments import training
 from ne_dreamer_jax import checkpoint, metrics, run_directory
-from tests.experiments import toy
+from tests.experiments import stub, toy
 
 LAST = 120
 
@@ -26,9 +26,9 @@ def terminate(_line):
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def train(path, do=kill, at=None, minutes=1e9):
+def train(path, do=kill, at=None, minutes=1e9, run=None):
     """Trains in a directory; at the first line with the text ``at`` in it, does something. Returns code and lines."""
-    lines, run = [], toy.run()
+    lines, run = [], run or stub.run()
 
     def echo(line):
         first = at is not None and at in line and not any(at in earlier for earlier in lines)
@@ -64,7 +64,8 @@ def finished(tmp_path_factory):
 
 def test_a_finished_run_leaves_its_files(finished):
     path, _ = finished
-    assert sorted(os.listdir(path)) == [".ne_dreamer_jax", "checkpoints", "config.json", "curve.png", "metrics.jsonl"]
+    files = [".ne_dreamer_jax", "checkpoints", "config.json", "curve.png", "metrics.jsonl", "policy.mp4"]
+    assert sorted(os.listdir(path)) == files
     assert run_directory.read_config(path, type(toy.config())) == toy.config()
 
 
@@ -73,11 +74,10 @@ def test_metrics_count_steps_updates_and_episodes(finished):
     chunks = [line for line in lines if "train/episodes" in line]
     assert [line["env_step"] for line in chunks] == [16, 32, 48, 64, 80, 96, 112, 120]
     assert all(line["agent_step"] == line["env_step"] for line in lines)  # action repeat 1
-    assert chunks[-1]["update"] == toy.run().loop.updates == 12
-    assert all(("train/loss/total" in line) == (line["env_step"] > 16) for line in chunks)  # after the prefill of 20
+    assert chunks[-1]["update"] == stub.run().loop.updates == 50
+    assert [("train/loss/total" in line) for line in chunks] == [False] + 7 * [True]  # after the prefill of 20
+    assert [("train/return" in line) for line in chunks] == 7 * [True] + [False]  # no episode ends in the last chunk
     assert all(np.isfinite(value) for line in lines for value in line.values())
-    # 60 vector steps, of which every episode takes 8: the reset's and 7 more.
-    assert sum(line["train/episodes"] for line in chunks) == 2 * (60 // (toy.LENGTH + 1))
 
 
 def test_evaluations_come_in_their_intervals_and_at_the_end(finished):
@@ -144,7 +144,7 @@ def test_a_damaged_checkpoint_costs_only_time(finished, tmp_path):
 
 def test_running_a_finished_run_again_changes_nothing(finished):
     path, _ = finished
-    before = {file: (path / file).read_bytes() for file in ("config.json", "metrics.jsonl", "curve.png")}
+    before = {file.name: file.read_bytes() for file in path.iterdir() if file.is_file()}
     bits = last_bits(path)
     code, lines = train(path)
     assert code == 0
@@ -172,3 +172,31 @@ def test_another_configuration_is_refused_before_anything_is_written(finished):
     ):
         pass
     assert json.loads((path / "config.json").read_text()) == before
+
+
+def test_a_video_that_was_not_written_is_made_up_for(finished, tmp_path):
+    with pytest.raises(Killed):
+        train(tmp_path, kill, "Saved the agent and the loop in")  # at the end, before the video
+    assert not (tmp_path / "policy.mp4").exists()
+    assert train(tmp_path)[0] == 0
+    assert (tmp_path / "policy.mp4").read_bytes() == (finished[0] / "policy.mp4").read_bytes()
+    assert measured(tmp_path) == measured(finished[0])
+
+
+def test_an_agent_without_pixels_leaves_no_video(tmp_path):
+    assert train(tmp_path, run=stub.build(toy.config(), image=False))[0] == 0
+    assert (tmp_path / "curve.png").exists()
+    assert not (tmp_path / "policy.mp4").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.strict
+def test_the_real_loop_goes_on_to_the_same_bits(tmp_path):
+    run = training.build(toy.config(), toy.env())
+    assert train(tmp_path / "straight", run=run)[0] == 0
+    assert train(tmp_path / "stopped", terminate, "env step 80", run=run)[0] == 128 + signal.SIGTERM
+    again = training.build(toy.config(), toy.env())  # as another process would make it
+    assert train(tmp_path / "stopped", run=again)[0] == 0
+    assert last_bits(tmp_path / "stopped") == last_bits(tmp_path / "straight")
+    assert measured(tmp_path / "stopped") == measured(tmp_path / "straight")
+    assert measured(tmp_path / "straight")[-1]["update"] == run.loop.updates

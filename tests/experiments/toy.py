@@ -1,14 +1,12 @@
-"""A run small enough for tests: a one-dimensional world, and the least agent."""
+"""The least agent in a one-dimensional world."""
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 
-from experiments import training
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import base
@@ -65,9 +63,3 @@ def env() -> base.Env:
     return base.from_core(
         base.Core(spec, reset, base.restart_or_step(reset, step), lambda state: {"position": state[0][None]})
     )
-
-
-@functools.cache
-def run() -> training.Run:
-    """The toy configuration in the toy world, compiled once."""
-    return training.build(config(), env())
