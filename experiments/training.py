@@ -17,7 +17,7 @@ import numpy as np
 
 import ne_dreamer_jax as nedreamer
 from experiments import plots, progress, video
-from experiments.record import Record, Saves
+from experiments.record import WHOLE, Record, Saves
 from experiments.schedule import Schedule
 from experiments.stop import Stop
 from ne_dreamer_jax import checkpoint, compile_cache, metrics
@@ -111,6 +111,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
             return 128 + (stop.signal or 0)
+    checkpoint.prune(files.checkpoints, whole=WHOLE, keep=1)  # nothing will go on from here
     if "image" in run.agent.spec.observation and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]

@@ -146,7 +146,7 @@ def restore(
             skipped.append(str(error))
             continue
         return Restored(checkpoint, items, skipped)
-    raise DamagedError(f"no checkpoint in {directory} is intact. {' '.join(skipped)}")
+    raise DamagedError(f"no checkpoint in {directory} is intact; remove it to begin anew. {' '.join(skipped)}")
 
 
 def checkpoints(directory: Path) -> list[Checkpoint]:

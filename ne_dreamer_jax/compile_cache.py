@@ -35,15 +35,15 @@ def enable() -> str:
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
         return f"{chosen} (JAX_COMPILATION_CACHE_DIR)"
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ne_dreamer_jax"
-    folder = base / _machine()
     try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ne_dreamer_jax"
+        folder = base / _machine()
         for path in (base, folder):
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             status = path.stat()
             if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o022:
                 return f"off: {path} belongs to someone else, or others may write to it; chmod 700 it, or remove it"
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home directory
         return f"off: {error}"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

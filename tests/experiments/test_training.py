@@ -107,9 +107,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_pa
 
 
 @pytest.mark.strict
-@pytest.mark.parametrize(
-    "stops", [["Compiling the training"], ["env step 64"], ["env step 48", "env step 96"], ["Evaluation"]]
-)
+@pytest.mark.parametrize("stops", [["Compiling the training"], ["env step 48", "env step 64"]])
 def test_stopping_and_going_on_changes_no_bit(finished, tmp_path, stops):
     for stop in stops:
         code, lines = train(tmp_path, terminate, stop)
@@ -123,7 +121,7 @@ def test_stopping_and_going_on_changes_no_bit(finished, tmp_path, stops):
 
 
 @pytest.mark.strict
-@pytest.mark.parametrize("at", ["env step 32", "env step 80", "Evaluation", "Finished"])
+@pytest.mark.parametrize("at", ["env step 80", "Finished"])
 def test_being_killed_and_going_on_changes_no_bit(finished, tmp_path, at):
     with pytest.raises(Killed):
         train(tmp_path, kill, at, minutes=0)
