@@ -113,8 +113,14 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     wage = n * ratio.numerator  # of one vector step
     prefill = max(-(-config.prefill // n), length + 1)
     updates = max(0, vector_steps - prefill) * wage // price
-    capacity = config.capacity or min(PAPER_CAPACITY, vector_steps * n)
-    capacity = max(capacity, (length + 1) * n) // n * n
+    least = (length + 1) * n
+    if config.capacity is not None and config.capacity < least:
+        raise ValueError(
+            f"loop.capacity: expected at least {least:,} transitions, a sequence of agent.batch_length {length} and the "
+            f"step before it for each of {n} environments, got {config.capacity:,}."
+        )
+    capacity = min(PAPER_CAPACITY, vector_steps * n) if config.capacity is None else config.capacity
+    capacity = max(capacity, least) // n * n
 
     step_envs, prepare_envs = jax.vmap(env.step), jax.vmap(env.prepare)
 
