@@ -49,7 +49,8 @@ def main(logdir: Path, episodes: int, prefer: str, seed: int, with_video: bool) 
     with refusing(run_directory.RefusedError, ValueError):
         config = run_directory.read_config(logdir, Config)
         # The smallest replay there is: none is read or allocated here, and the run's may not fit this machine.
-        run = training.build(replace(config, loop=replace(config.loop, capacity=1)))
+        smallest = (config.agent.batch_length + 1) * config.loop.num_envs
+        run = training.build(replace(config, loop=replace(config.loop, capacity=smallest)))
     with refusing(FileNotFoundError, checkpoint.DamagedError, ValueError):
         restored = checkpoint.restore(files.checkpoints, {"agent": run.shapes.train}, prefer=prefer)
     for reason in restored.skipped:
