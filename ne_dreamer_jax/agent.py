@@ -198,25 +198,27 @@ def _check_loss_scales(config: AgentConfig) -> None:
         )
 
 
-def _arrays(specs: Mapping[str, ArraySpec], lead: tuple[int, ...]) -> dict[str, jax.ShapeDtypeStruct]:
+def _arrays(specs: Mapping[str, ArraySpec], lead: tuple[int, ...]) -> dict[str, Any]:
     return {name: jax.ShapeDtypeStruct((*lead, *s.shape), s.dtype) for name, s in specs.items()}
 
 
 def _batch_shapes(config: AgentConfig, spec: EnvSpec, batch: int, length: int) -> Batch:
-    """What a batch of B sequences of T steps must be."""
+    """What a batch of B sequences of T steps must be: ShapeDtypeStructs in the arrays' places."""
     lead, rssm = (batch, length), config.rssm
-    action = jax.ShapeDtypeStruct((*lead, *spec.action.shape), spec.action.dtype)
-    flag = jax.ShapeDtypeStruct(lead, jnp.bool_)
-    deter = jax.ShapeDtypeStruct((batch, rssm.deter), jnp.float32)
-    stoch = jax.ShapeDtypeStruct((batch, rssm.stoch, rssm.classes), jnp.float32)
+    action: Any = jax.ShapeDtypeStruct((*lead, *spec.action.shape), spec.action.dtype)
+    flag: Any = jax.ShapeDtypeStruct(lead, jnp.bool_)
+    deter: Any = jax.ShapeDtypeStruct((batch, rssm.deter), jnp.float32)
+    stoch: Any = jax.ShapeDtypeStruct((batch, rssm.stoch, rssm.classes), jnp.float32)
+    reward: Any = jax.ShapeDtypeStruct(lead, jnp.float32)
+    index: Any = jax.ShapeDtypeStruct(lead, jnp.int32)
     return Batch(
         obs=_arrays(spec.observation, lead),
         action=action,
         prev_action=action,
-        reward=jax.ShapeDtypeStruct(lead, jnp.float32),
+        reward=reward,
         is_first=flag,
         is_last=flag,
         is_terminal=flag,
         context=Latent(deter, stoch),
-        index=jax.ShapeDtypeStruct(lead, jnp.int32),
+        index=index,
     )
