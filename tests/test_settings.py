@@ -70,6 +70,15 @@ def test_a_field_is_set_by_its_path_in_its_own_type(assignment, path, value):
     assert {name for name in before if before[name] != after[name]} <= {path}
 
 
+def test_every_setting_is_taken_back_as_it_is_shown():
+    changed = dataclasses.replace(Run(), steps=3, bfloat16=True, widths=(), objective=Nothing())
+    for config in (Run(), changed, settings.override(Run(), "optimizer.clip=none")):
+        rebuilt = config
+        for path, value in settings.paths(config).items():
+            rebuilt = settings.override(rebuilt, f"{path}={settings.as_text(value)}")
+        assert rebuilt == config
+
+
 def test_a_dataclass_is_chosen_by_its_name():
     assert settings.override(Run(), "objective=Nothing") == dataclasses.replace(Run(), objective=Nothing())
     assert settings.paths(Run())["objective"] == "Predictor"

@@ -3,8 +3,14 @@
 import difflib
 
 DMC: dict[str, tuple[str, ...]] = {
+    "acrobot": ("swingup",),
+    "ball_in_cup": ("catch",),
     "cartpole": ("balance", "balance_sparse", "swingup", "swingup_sparse"),
+    "cheetah": ("run",),
+    "finger": ("spin", "turn_easy", "turn_hard"),
+    "hopper": ("hop", "stand"),
     "pendulum": ("swingup",),
+    "quadruped": ("run", "walk"),
     "reacher": ("easy", "hard"),
     "walker": ("stand", "walk", "run"),
 }
@@ -19,9 +25,7 @@ def names() -> tuple[str, ...]:
 def split_dmc(name: str) -> tuple[str, str]:
     """``"dmc/cartpole_swingup_sparse"`` -> ``("cartpole", "swingup_sparse")``."""
     check(name)
-    return next(
-        (domain, task) for domain, tasks in DMC.items() for task in tasks if name == f"dmc/{domain}_{task}"
-    )
+    return next((domain, task) for domain, tasks in DMC.items() for task in tasks if name == f"dmc/{domain}_{task}")
 
 
 def check(name: str) -> None:

@@ -47,14 +47,13 @@ def twohot_encode(x: jax.Array, bins: jax.Array) -> jax.Array:
     Source: DreamerV3, eq. for twohot(x).
     """
     x, bins = x.astype(jnp.float32), bins.astype(jnp.float32)
-    # A binary search, unrolled: eight gathers for 255 bins, and no loop on the device.
-    upper = jnp.searchsorted(bins, x, side="right", method="scan_unrolled").astype(jnp.int32)
-    below = jnp.clip(upper - 1, 0, bins.shape[0] - 2)
-    low, high = bins[below], bins[below + 1]
-    weight = jnp.clip((x - low) / (high - low), 0.0, 1.0)[..., None]
-    # Compared with an iota instead of scattered: this fuses into whatever consumes the weights.
-    offset = jax.lax.broadcasted_iota(jnp.int32, (*x.shape, bins.shape[0]), x.ndim) - below[..., None]
-    return jnp.where(offset == 0, 1.0 - weight, 0.0) + jnp.where(offset == 1, weight, 0.0)
+    # Every bin's weight is a hat function of x: one at the bin, falling to zero at its neighbours. That is one
+    # elementwise pass, which fuses into whatever consumes the weights; a search for the neighbours would not.
+    x = jnp.clip(x, bins[0], bins[-1])[..., None]
+    before, after = 2 * bins[:1] - bins[1:2], 2 * bins[-1:] - bins[-2:-1]  # where neighbours of the outer bins would be
+    hat = (jnp.concatenate([before, bins[:-1]]), bins, jnp.concatenate([bins[1:], after]))
+    below, at, above = (jnp.expand_dims(b, range(x.ndim - 1)) for b in hat)
+    return jnp.clip(jnp.minimum((x - below) / (at - below), (above - x) / (above - at)), 0.0, 1.0)
 
 
 def twohot_mean(logits: jax.Array, bins: jax.Array) -> jax.Array:
@@ -97,4 +96,6 @@ def twohot_loss(logits: jax.Array, target: jax.Array, bins: jax.Array) -> jax.Ar
     if logits.shape != (*target.shape, *bins.shape):
         raise ValueError(f"expected logits of shape {(*target.shape, *bins.shape)} [..., K], got {logits.shape}")
     weights = twohot_encode(jax.lax.stop_gradient(target), bins)
-    return -jnp.sum(weights * jax.nn.log_softmax(logits.astype(jnp.float32)), axis=-1)
+    logits = logits.astype(jnp.float32)
+    # The weights sum to one, so the normaliser comes out of the sum, and no array of log-probabilities is needed.
+    return jax.nn.logsumexp(logits, axis=-1) - jnp.sum(weights * logits, axis=-1)

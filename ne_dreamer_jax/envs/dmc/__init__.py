@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax.envs import base
-from ne_dreamer_jax.envs.dmc.common import Episode, Task, mjx
+from ne_dreamer_jax.envs.dmc.common import Episode, Task
+from ne_dreamer_jax.envs.dmc.simulation import Integrated, integrated, mjx
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec
 
 _MAX_VALUE = 1e10  # MuJoCo's own bound (mjMAXVAL) beyond which a position or velocity counts as broken
@@ -30,9 +31,7 @@ def load(domain: str, task: str) -> Task:
     return importlib.import_module(f"ne_dreamer_jax.envs.dmc.{domain}").load(task)
 
 
-def make(
-    domain: str, task: str, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64
-) -> base.Env:
+def make(domain: str, task: str, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> base.Env:
     """Makes a Control Suite environment. Its ``env_state.physics`` is the ``mjx.Data``.
 
     Args:
@@ -66,39 +65,45 @@ def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core
         scene = render.build(simulation.mj_model, task.camera, height=image_size, width=image_size)
 
     def reset(key: Array) -> State:
-        data, episode = task.reset(key)
-        return State(simulation.begin(data), episode, jnp.full((), time_limit, jnp.int32))
+        start, episode = task.reset(key)
+        return State(simulation.begin(start), episode, jnp.full((), time_limit, jnp.int32))
 
-    def step(state: State, action: Array) -> tuple[State, base.Progress]:
-        control = middle + half * action
+    def step(state: State, action: Array, restart: Array, key: Array) -> tuple[State, base.Progress]:
+        def draw() -> tuple[Integrated, Episode]:
+            start, episode = task.reset(key)
+            return integrated(start), episode
+
+        start, episode = base.if_needed(restart, draw, (integrated(state.physics), state.episode))
+        steps_left = jnp.where(restart, time_limit, state.steps_left)
 
         def control_step(_: Array, carry: tuple[mjx.Data, Array]) -> tuple[mjx.Data, Array]:
             data, reward = carry
-            data = simulation.advance(data, control)
-            return data, reward + task.reward(data, state.episode)
+            data = simulation.advance(data, middle + half * action, restart, start)
+            return data, reward + task.reward(data, episode)
 
         # Where the time limit is no multiple of the repeat, the last step of an episode is shorter.
-        repeat = action_repeat if time_limit % action_repeat == 0 else jnp.minimum(action_repeat, state.steps_left)
-        start = (state.physics, jnp.zeros((), jnp.float32))
-        data, reward = jax.lax.fori_loop(0, repeat, control_step, start)
-        steps_left = state.steps_left - repeat
+        repeat = action_repeat if time_limit % action_repeat == 0 else jnp.minimum(action_repeat, steps_left)
+        unrewarded = (state.physics, jnp.zeros((), jnp.float32))
+        data, reward = jax.lax.fori_loop(0, repeat, control_step, unrewarded)
+        steps_left = jnp.where(restart, time_limit, steps_left - repeat)
         sound = (jnp.abs(data.qpos) <= _MAX_VALUE).all() & (jnp.abs(data.qvel) <= _MAX_VALUE).all()
         progress = base.Progress(reward, is_last=steps_left <= 0, is_terminal=jnp.zeros((), bool), is_sound=sound)
-        return State(data, state.episode, steps_left), progress
+        return State(data, episode, steps_left), progress
 
     def observe(state: State) -> dict[str, Array]:
         observation = {}
         if obs != "vector":
-            overrides = task.overrides(state.episode)
-            observation["image"] = render.draw(scene, state.physics, overrides)
+            observation["image"] = render.draw(scene, task.pose(state.physics, state.episode))
         if obs != "pixels":
             vectors = task.observe(state.physics, state.episode)
             observation |= {name: value.astype(jnp.float32) for name, value in vectors.items()}
         return observation
 
-    shapes: Any = jax.eval_shape(lambda key: observe(reset(key)), jax.random.key(0))
-    spec = EnvSpec(
-        observation={name: ArraySpec(value.shape, value.dtype) for name, value in shapes.items()},
-        action=ContinuousAction(simulation.mj_model.nu),
-    )
+    shapes = {}
+    if obs != "vector":
+        shapes["image"] = ArraySpec((image_size, image_size, 3), jnp.uint8)
+    if obs != "pixels":
+        vectors: Any = jax.eval_shape(task.observe, simulation.initial(), task.episode)
+        shapes |= {name: ArraySpec(value.shape, jnp.float32) for name, value in vectors.items()}
+    spec = EnvSpec(shapes, ContinuousAction(simulation.mj_model.nu))
     return base.Core(spec, reset, step, observe)

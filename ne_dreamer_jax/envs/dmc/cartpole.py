@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.envs.dmc.common import Episode, Simulation, Task, mjx, uniform
+from ne_dreamer_jax.envs.dmc.common import Episode, Task, uniform
 from ne_dreamer_jax.envs.dmc.rewards import tolerance
+from ne_dreamer_jax.envs.dmc.simulation import Simulation, mjx
 from ne_dreamer_jax.types import Array
 
 

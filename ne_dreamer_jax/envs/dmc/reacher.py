@@ -4,9 +4,11 @@ import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
-from ne_dreamer_jax.envs.dmc.common import Episode, Simulation, Task, mjx, random_joints, uniform
+from ne_dreamer_jax.envs.dmc.common import Episode, Task, random_joints, uniform
 from ne_dreamer_jax.envs.dmc.rewards import tolerance
+from ne_dreamer_jax.envs.dmc.simulation import Simulation, mjx
 from ne_dreamer_jax.types import Array
 
 _TARGET_RADIUS = {"easy": 0.05, "hard": 0.015}
@@ -14,12 +16,15 @@ _TARGET_RADIUS = {"easy": 0.05, "hard": 0.015}
 
 def load(task: str) -> Task:
     """Tasks: easy, hard. The episode is the target's place in the plane, float32 [2], in metres."""
-    simulation = Simulation.load("reacher.xml")
+
+    def resize_target(spec: mujoco.MjSpec) -> None:
+        spec.geom("target").size[0] = _TARGET_RADIUS[task]
+
+    simulation = Simulation.load("reacher.xml", edit=resize_target)
     mj_model = simulation.mj_model
-    mj_model.geom("target").size[0] = _TARGET_RADIUS[task]
     initial = simulation.initial()
-    finger = mj_model.geom("finger").id
-    touching = float(mj_model.geom("target").size[0] + mj_model.geom("finger").size[0])
+    finger, ball = mj_model.geom("finger").id, mj_model.geom("target").id
+    touching = float(mj_model.geom_size[[finger, ball], 0].sum())
     sample_joints = random_joints(mj_model)
 
     def reset(key: Array) -> tuple[mjx.Data, Episode]:
@@ -38,4 +43,7 @@ def load(task: str) -> Task:
     def observe(data: mjx.Data, target: Array) -> dict[str, Array]:
         return {"position": data.qpos, "to_target": finger_to_target(data, target), "velocity": data.qvel}
 
-    return Task(simulation, 20.0, reset, reward, observe)
+    def pose(data: mjx.Data, target: Array) -> mjx.Data:
+        return data.replace(geom_xpos=data.geom_xpos.at[ball, :2].set(target))
+
+    return Task(simulation, 20.0, reset, reward, observe, jnp.zeros(2), pose=pose)

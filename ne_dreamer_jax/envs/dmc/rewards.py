@@ -48,7 +48,9 @@ def tolerance(
     if sigmoid not in _SIGMOIDS:
         raise ValueError(f"expected a sigmoid out of {sorted(_SIGMOIDS)}, got {sigmoid!r}")
     if not (0 < value_at_margin < 1 or (value_at_margin == 0 and sigmoid != "gaussian")):
-        raise ValueError(f"expected value_at_margin below 1 and above 0 (0 allowed unless gaussian), got {value_at_margin}")
+        raise ValueError(
+            f"expected value_at_margin below 1 and above 0 (0 allowed unless gaussian), got {value_at_margin}"
+        )
     inside = (lower <= x) & (x <= upper)
     if margin == 0:
         return inside.astype(jnp.float32)

@@ -2,8 +2,9 @@
 
 import jax.numpy as jnp
 
-from ne_dreamer_jax.envs.dmc.common import Episode, Simulation, Task, mjx, random_joints
+from ne_dreamer_jax.envs.dmc.common import Episode, Task, random_joints
 from ne_dreamer_jax.envs.dmc.rewards import tolerance
+from ne_dreamer_jax.envs.dmc.simulation import Simulation, mjx
 from ne_dreamer_jax.types import Array
 
 _STAND_HEIGHT = 1.2  # metres
