@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -281,7 +282,7 @@ def _refuse_unsupported(model: mujoco.MjModel, camera_id: int) -> None:
         refuse(f"flex {model.flex(0).name!r}", "flexes are not supported")
     for kind, named, count in (("geom", model.geom, model.ngeom), ("site", model.site, model.nsite)):
         types, rgba, material = (getattr(model, f"{kind}_{field}") for field in ("type", "rgba", "matid"))
-        drawn = _drawn(getattr(model, f"{kind}_group"), rgba, material, model) if count else []
+        drawn: Any = _drawn(getattr(model, f"{kind}_group"), rgba, material, model) if count else []
         for i in drawn:
             name = f"{kind} {named(i).name!r}"
             if int(types[i]) not in _KINDS:
