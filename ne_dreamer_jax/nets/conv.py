@@ -71,7 +71,7 @@ def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.f
 
 
 def _on_cpu() -> bool:
-    device = jax.config.read("jax_default_device")  # a device, the name of a platform, or None
+    device = getattr(jax.config, "jax_default_device", None)  # a device, the name of a platform, or None
     if device is None:
         return jax.default_backend() == "cpu"
     return getattr(device, "platform", device) == "cpu"
