@@ -20,7 +20,7 @@ import numpy as np
 
 os.environ.setdefault("MUJOCO_GL", "osmesa")
 
-from dm_control import suite  # noqa: E402
+from dm_control import suite
 
 SIZE = 64
 TASKS = {
