@@ -106,8 +106,8 @@ def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
 def _stage(values: Any) -> Any:
     """The same arrays, computed once and stored.
 
-    XLA:CPU fuses producers into each of their consumers, computes them again for each, and removes optimization barriers
-    before it does so. Fusion ends at a loop that it can't see through; this one makes no iteration.
+    XLA:CPU fuses producers into each of their consumers, computes them again for each, and removes optimization
+    barriers before it does so. Fusion ends at a loop that it can't see through; this one makes no iteration.
     """
     none = jax.lax.optimization_barrier(jnp.int32(0))
     return jax.lax.fori_loop(jnp.int32(0), none, lambda _, carry: jax.tree.map(lambda a: a + 1, carry), values)
@@ -337,8 +337,10 @@ def _fetch(view: _View, number: Array) -> _Surface:
         rows.append(jnp.stack([component for v in row for component in (v.x, v.y, v.z)]))
     table = jnp.concatenate(rows, 1)  # [12, P]
     chosen = (number[None] == jnp.arange(view.count, dtype=jnp.int32)[:, None]).astype(jnp.float32)  # [P, N]
-    row = jax.lax.dot(table, chosen, precision=jax.lax.Precision.HIGHEST)
-    return _Surface(Vec(*row[:3]), Vec(*row[3:6]), row[6], row[7], row[8] > 0.5, Vec(*row[9:12]))
+    fetched = jax.lax.dot(table, chosen, precision=jax.lax.Precision.HIGHEST)
+    return _Surface(
+        Vec(*fetched[:3]), Vec(*fetched[3:6]), fetched[6], fetched[7], fetched[8] > 0.5, Vec(*fetched[9:12])
+    )
 
 
 def _normal(view: _View, number: Array, surface: _Surface, point: Vec, direction: Vec) -> tuple[Vec, Array]:
