@@ -117,8 +117,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     least = (length + 1) * n
     if config.capacity is not None and config.capacity < least:
         raise ValueError(
-            f"loop.capacity: expected at least {least:,} transitions, a sequence of agent.batch_length {length} and the "
-            f"step before it for each of {n} environments, got {config.capacity:,}."
+            f"loop.capacity: expected at least {least:,} transitions, agent.batch_length {length} and the "
+            f"step before for each of {n} environments, got {config.capacity:,}."
         )
     capacity = min(PAPER_CAPACITY, vector_steps * n) if config.capacity is None else config.capacity
     capacity = max(capacity, least) // n * n

@@ -47,7 +47,7 @@ class NextEmbedding:
         Raises ValueError where sequences are too short for the shift, or too long for the predictor's positions.
         """
         if self.shift >= sizes.length:
-            raise ValueError(f"objective.shift: expected less than agent.batch_length {sizes.length}, got {self.shift}.")
+            raise ValueError(f"objective.shift: expected less than agent.batch_length {sizes.length}, got {self.shift}")
         check_length(self.predictor, sizes.length)
         discrete = isinstance(sizes.spec.action, DiscreteAction)
         predictor = Predictor(self.predictor, sizes.embedding, discrete, self.across_episodes, sizes.dtype)
