@@ -72,7 +72,7 @@ def state(agent: Any, seed: int = 0) -> Any:
     """A train state with random parameters, and all else as at the start."""
     shapes = jax.eval_shape(agent.init, jax.random.key(0))
     filled = fill(shapes.params, seed)
-    rest = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(params=0, key=0))
+    rest = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes._replace(params=None, key=None))
     return rest._replace(params=filled, slow_critic=jax.tree.map(jnp.copy, filled["critic"]), key=jax.random.key(seed))
 
 
@@ -124,7 +124,8 @@ def with_objective(**changes: Any) -> AgentConfig:
 
 def program(function: Any, *args: Any) -> str:
     """What a function computes, as text: equal for equal computations."""
-    return re.sub(r" at 0x[0-9a-f]+", "", str(jax.make_jaxpr(function)(*args)))
+    jaxpr = jax.make_jaxpr(function)(*args)
+    return re.sub(r" at 0x[0-9a-f]+", "", f"{jaxpr} {jaxpr.consts}")
 
 
 def assert_same(got: Any, want: Any) -> None:
