@@ -62,7 +62,7 @@ class _View(NamedTuple):
     camera: Vec  # scalars
     lights: list[PlacedLight]
     solids: list[_Solids]
-    count: int  # of all objects; numbers from 0, then the floor's, then the sky's
+    objects: int  # how many; numbers from 0, then the floor's, then the sky's
 
 
 def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
@@ -118,13 +118,13 @@ def _encode(view: _View, distance: Any, number: Any) -> Array:
 
     Positive floats sort as their bits do; the number replaces the lowest of these.
     """
-    mask = (1 << (view.count + 1).bit_length()) - 1
+    mask = (1 << (view.objects + 1).bit_length()) - 1
     return (jax.lax.bitcast_convert_type(jnp.asarray(distance), jnp.int32) & ~mask) | number
 
 
 def _decode(view: _View, key: Array) -> tuple[Array, Array]:
     """Object's number and distance."""
-    mask = (1 << (view.count + 1).bit_length()) - 1
+    mask = (1 << (view.objects + 1).bit_length()) - 1
     return key & mask, jax.lax.bitcast_convert_type(key & ~mask, jnp.float32)
 
 
@@ -252,7 +252,7 @@ def _floor_color(view: _View, floor: FloorView) -> Vec:
     for placed, own in zip(view.lights, floor.lights, strict=True):
         color = _add(color, _round(own) * _lit(view, placed, floor.point, jnp.int32(-1)))
     assert view.scene.floor is not None
-    if view.scene.floor.reflectance > 0 and view.count:
+    if view.scene.floor.reflectance > 0 and view.objects:
         color = _add(color, _round(_reflection(view, floor)))
     return color
 
@@ -263,10 +263,10 @@ def _reflection(view: _View, floor: FloorView) -> Vec:
     assert scene.floor is not None
     mirrored = view._replace(camera=floors.mirror_point(scene.floor, view.camera))
     samples, center = (floors.mirror(scene.floor, d) for d in (scene.sample_rays, scene.center_rays))
-    key = _encode(view, jnp.full(floor.sample_distance.shape, _FAR, jnp.float32), view.count)
+    key = _encode(view, jnp.full(floor.sample_distance.shape, _FAR, jnp.float32), view.objects)
     key = _stage(_nearest(view, mirrored.camera, samples, key, after=floor.sample_distance))
     number, distance = _decode(view, key)
-    hit = number < view.count
+    hit = number < view.objects
     front = jnp.where(hit, number, -1).max(0)
     color = _solid_color(mirrored, samples, center, front, number == front[None], distance, scene.floor.reflectance)
     return Vec.where(front >= 0, color * _fraction(hit), _BLACK)
@@ -336,7 +336,7 @@ def _fetch(view: _View, number: Array) -> _Surface:
         row = (shape.center, shape.z, Vec(radius, half, ones if flat else ones * 0.0), group.rgb)
         rows.append(jnp.stack([component for v in row for component in (v.x, v.y, v.z)]))
     table = jnp.concatenate(rows, 1)  # [12, P]
-    chosen = (number[None] == jnp.arange(view.count, dtype=jnp.int32)[:, None]).astype(jnp.float32)  # [P, N]
+    chosen = (number[None] == jnp.arange(view.objects, dtype=jnp.int32)[:, None]).astype(jnp.float32)  # [P, N]
     fetched = jax.lax.dot(table, chosen, precision=jax.lax.Precision.HIGHEST)
     return _Surface(
         Vec(*fetched[:3]), Vec(*fetched[3:6]), fetched[6], fetched[7], fetched[8] > 0.5, Vec(*fetched[9:12])
