@@ -71,7 +71,8 @@ def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.f
 
 
 def _on_cpu() -> bool:
-    device = getattr(jax.config, "jax_default_device", None)  # a device, the name of a platform, or None
+    # A device, the name of a platform, or None.
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
     if device is None:
         return jax.default_backend() == "cpu"
     return getattr(device, "platform", device) == "cpu"
