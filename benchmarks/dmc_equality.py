@@ -88,7 +88,7 @@ def record(name: str, num_steps: int, seed: int = 0, action_repeat: int = 2, res
             timestep = env.step((low + high) / 2 + (high - low) / 2 * action)
             reward += timestep.reward
         obs = {key: np.array(value) for key, value in timestep.observation.items()}
-        rows.append(Recording(start, fields(data, _INTEGRATED + _DERIVED), action, episode, reward, obs))
+        rows.append(Recording(start, fields(data, _INTEGRATED + _DERIVED), action, episode, np.array(reward), obs))
     return jax.tree.map(lambda *values: np.stack(values).astype(np.float64), *rows)
 
 

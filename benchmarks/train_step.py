@@ -83,7 +83,7 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
     from ne_dreamer_jax.objectives import Sizes
 
     nets = Networks.build(spec, config.encoder, config.rssm, config.heads, jnp.dtype(config.compute_dtype))
-    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, nets.dtype))
+    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, config.batch_length, nets.dtype))
     key = jax.random.key(2)
     params = jax.tree.map(jnp.copy, state.params)  # the update donates the others
     slow, target, scale = jax.tree.map(jnp.copy, (state.slow_critic, state.target, state.return_scale))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -26,7 +27,7 @@ from ne_dreamer_jax import run_directory
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of these episodes' beginnings."
 )
 @click.option("--video", "with_video", is_flag=True, help="Write one episode to policy.mp4 in the directory.")
-def main(logdir: Path, episodes: int, prefer: str, seed: int, with_video: bool) -> None:
+def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: int, with_video: bool) -> None:
     """Play episodes with the trained policy of a run, beside a random policy's on the same task.
 
     The actions are the policy's mode, the episodes none that training or its evaluations had. The result is printed
@@ -49,7 +50,8 @@ def main(logdir: Path, episodes: int, prefer: str, seed: int, with_video: bool) 
     with refusing(run_directory.RefusedError, ValueError):
         config = run_directory.read_config(logdir, Config)
         # The smallest replay there is: none is read or allocated here, and the run's may not fit this machine.
-        run = training.build(replace(config, loop=replace(config.loop, capacity=1)))
+        smallest = (config.agent.batch_length + 1) * config.loop.num_envs
+        run = training.build(replace(config, loop=replace(config.loop, capacity=smallest)))
     with refusing(FileNotFoundError, checkpoint.DamagedError, ValueError):
         restored = checkpoint.restore(files.checkpoints, {"agent": run.shapes.train}, prefer=prefer)
     for reason in restored.skipped:

@@ -54,7 +54,8 @@ class Saves:
     def whole(self, state: LoopState, counters: Counters, score: float | None) -> None:
         """Saves everything, unless it stands there already."""
         if not any(found.score == score for found in self._whole_at(counters)):
-            self._save({"agent": state.train, "loop": state._replace(train=())}, counters, score)
+            rest: Any = ()
+            self._save({"agent": state.train, "loop": state._replace(train=rest)}, counters, score)
         self._last = time.monotonic()
 
     def if_best(self, state: LoopState, counters: Counters, score: float) -> None:

@@ -130,7 +130,7 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
       with_random: whether to evaluate a random policy too.
     """
     policy_key, random_key = jax.random.split(jax.random.fold_in(key, state.counters.vector_step))
-    values = {}
+    values: dict[str, float] = {}
     if with_random:
         echo("Compiling the evaluation, and playing episodes with a random policy.")
         values |= _returns(run.loop.evaluate(state.train.params, random_key, random=True, frames=True), "eval/random_")

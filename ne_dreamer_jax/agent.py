@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from ne_dreamer_jax import behavior, optim, world_model
+from ne_dreamer_jax import behavior, optim, shapes, world_model
 from ne_dreamer_jax.behavior import BehaviorConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
@@ -21,6 +21,7 @@ from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding, Sizes
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import (
     Array,
+    ArraySpec,
     Batch,
     EnvSpec,
     Latent,
@@ -90,7 +91,7 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     """
     dtype = _compute_dtype(config.compute_dtype)
     nets = Networks.build(spec, config.encoder, config.rssm, config.heads, dtype)
-    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, dtype))
+    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, config.batch_length, dtype))
     optimizer = optim.make(config.optimizer)
     _check_loss_scales(config)
 
@@ -117,7 +118,8 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     ) -> tuple[PolicyState, Array]:
         if mode not in ("sample", "mode"):
             raise ValueError(f"mode: expected 'sample' or 'mode', got {mode!r}.")
-        _check_obs(spec, timestep.obs, state.prev_action.shape[:1])
+        lead = state.prev_action.shape[:1]
+        shapes.check(_arrays(spec.observation, lead), dict(timestep.obs), "the agent")
         latent_key, action_key = jax.random.split(key)
         latent = world_model.posterior_step(nets, params, latent_key, state, timestep)
         distribution = policy(config.heads, spec.action, nets.apply("actor", params, feature(latent)))
@@ -142,7 +144,7 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         return total, (rollout.latent, scale, metrics)
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Latent, Metrics]:
-        _check_obs(spec, batch.obs, batch.reward.shape)
+        shapes.check(_batch_shapes(config, spec, *(*batch.reward.shape, 1, 1)[:2]), batch, "the agent")
         key, loss_key = jax.random.split(state.key)
         grads, (latent, scale, metrics) = jax.grad(losses, has_aux=True)(state.params, state, loss_key, batch)
         updates, optimizer_state = optimizer.update(grads, state.optimizer, state.params)
@@ -196,14 +198,27 @@ def _check_loss_scales(config: AgentConfig) -> None:
         )
 
 
-def _check_obs(spec: EnvSpec, obs: Mapping[str, Array], leading: tuple[int, ...]) -> None:
-    expected = {name: (*leading, *s.shape) for name, s in spec.observation.items()}
-    got = {name: tuple(x.shape) for name, x in obs.items()}
-    dtypes = {name: jnp.dtype(s.dtype) for name, s in spec.observation.items()}
-    got_dtypes = {name: jnp.dtype(x.dtype) for name, x in obs.items()}
-    if expected != got or dtypes != got_dtypes:
-        describe = lambda shapes, kinds: {n: f"{kinds[n].name}{list(shapes[n])}" for n in sorted(shapes)}
-        raise ValueError(
-            f"Observations do not fit the agent's spec: expected {describe(expected, dtypes)}, got "
-            f"{describe(got, got_dtypes)}. Make the agent with the spec of the environment that the data comes from."
-        )
+def _arrays(specs: Mapping[str, ArraySpec], lead: tuple[int, ...]) -> dict[str, Any]:
+    return {name: jax.ShapeDtypeStruct((*lead, *s.shape), s.dtype) for name, s in specs.items()}
+
+
+def _batch_shapes(config: AgentConfig, spec: EnvSpec, batch: int, length: int) -> Batch:
+    """What a batch of B sequences of T steps must be: ShapeDtypeStructs in the arrays' places."""
+    lead, rssm = (batch, length), config.rssm
+    action: Any = jax.ShapeDtypeStruct((*lead, *spec.action.shape), spec.action.dtype)
+    flag: Any = jax.ShapeDtypeStruct(lead, jnp.bool_)
+    deter: Any = jax.ShapeDtypeStruct((batch, rssm.deter), jnp.float32)
+    stoch: Any = jax.ShapeDtypeStruct((batch, rssm.stoch, rssm.classes), jnp.float32)
+    reward: Any = jax.ShapeDtypeStruct(lead, jnp.float32)
+    index: Any = jax.ShapeDtypeStruct(lead, jnp.int32)
+    return Batch(
+        obs=_arrays(spec.observation, lead),
+        action=action,
+        prev_action=action,
+        reward=reward,
+        is_first=flag,
+        is_last=flag,
+        is_terminal=flag,
+        context=Latent(deter, stoch),
+        index=index,
+    )

@@ -1,6 +1,6 @@
 """Acting, the environments, replay and learning as one compiled program.
 
-``Loop.chunk`` runs a number of vector steps on the device: act, add to replay, step the environments, and as many
+``Loop.chunk`` runs a number of vector steps on the device: step the environments, act, add to replay, and as many
 updates as the replay ratio asks for. The host sees one dict of metrics a chunk. The whole state is one pytree, so
 that going on from a saved one gives the same bits as never having stopped; where chunks begin and end changes none.
 """
@@ -67,8 +67,7 @@ class LoopState(NamedTuple):
 
     train: TrainState
     env: Any  # environment states, [N, ...]
-    timestep: TimeStep  # [N, ...], not yet acted upon
-    policy: PolicyState  # [N, ...]
+    policy: PolicyState  # [N, ...]; its prev_action is what the environments are stepped with next
     replay: Any
     episodes: Episodes
     counters: Counters
@@ -114,10 +113,16 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     wage = n * ratio.numerator  # of one vector step
     prefill = max(-(-config.prefill // n), length + 1)
     updates = max(0, vector_steps - prefill) * wage // price
-    capacity = config.capacity or min(PAPER_CAPACITY, vector_steps * n)
-    capacity = max(capacity, (length + 1) * n) // n * n
+    least = (length + 1) * n
+    if config.capacity is not None and config.capacity < least:
+        raise ValueError(
+            f"loop.capacity: expected at least {least:,} transitions, a sequence of agent.batch_length {length} and "
+            f"the step before it for each of {n} environments, got {config.capacity:,}."
+        )
+    capacity = min(PAPER_CAPACITY, vector_steps * n) if config.capacity is None else config.capacity
+    capacity = max(capacity, least) // n * n
 
-    step_envs, reset_envs = jax.vmap(env.step), jax.vmap(env.reset)
+    step_envs, prepare_envs = jax.vmap(env.step), jax.vmap(env.prepare)
 
     def transition(timestep: TimeStep, policy: PolicyState, action: Array) -> Transition:
         flags = (timestep.is_first, timestep.is_last, timestep.is_terminal)
@@ -126,23 +131,21 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     def example() -> Transition:
         """The shapes of one vector step's transition."""
 
-        def build(key: Array) -> Transition:
-            _, timestep = reset_envs(jax.random.split(key, n))
-            policy = agent.init_policy(n)
-            return transition(timestep, policy, policy.prev_action)
+        def build() -> Transition:
+            obs = {name: jnp.zeros((n, *s.shape), s.dtype) for name, s in agent.spec.observation.items()}
+            no, policy = jnp.zeros((n,), bool), agent.init_policy(n)
+            return transition(TimeStep(obs, jnp.zeros((n,)), no, no, no), policy, policy.prev_action)
 
-        return jax.eval_shape(build, jax.random.key(0))
+        return jax.eval_shape(build)
 
     shapes, latent_dtype = example(), jnp.dtype(config.latent_dtype)
     replay_lib.check_capacity(shapes, capacity, n, latent_dtype)
 
     def init(key: Array) -> LoopState:
         agent_key, env_key, key = jax.random.split(key, 3)
-        env_state, timestep = jax.jit(reset_envs)(jax.random.split(env_key, n))
         return LoopState(
             train=agent.init(agent_key),
-            env=env_state,
-            timestep=timestep,
+            env=prepare_envs(jax.random.split(env_key, n)),
             policy=agent.init_policy(n),
             replay=replay_lib.init(shapes, capacity, n, latent_dtype),
             episodes=Episodes(jnp.zeros((n,)), jnp.zeros((n,), jnp.int32)),
@@ -161,10 +164,9 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
 
     def vector_step(state: LoopState, sums: Metrics, episode_sums: Metrics) -> tuple[LoopState, Metrics, Metrics]:
         key, act_key, update_key = jax.random.split(state.key, 3)
-        timestep = state.timestep
+        env_state, timestep = step_envs(state.env, state.policy.prev_action)
         policy, action = agent.act(state.train.params, state.policy, timestep, act_key)
         replay = replay_lib.add(state.replay, transition(timestep, policy, action))
-        env_state, next_timestep = step_envs(state.env, action)
 
         ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
         steps = jnp.where(timestep.is_first, 0, state.episodes.length) + 1
@@ -183,7 +185,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         )
         counters = Counters(done, credit - due * price)
         episodes = Episodes(ret, steps)
-        return LoopState(train, env_state, next_timestep, policy, replay, episodes, counters, key), sums, episode_sums
+        return LoopState(train, env_state, policy, replay, episodes, counters, key), sums, episode_sums
 
     def chunk(state: LoopState, steps: Array) -> tuple[LoopState, Metrics]:
         batch = jax.eval_shape(lambda r, k: replay_lib.sample(r, k, b, length), state.replay, state.key)
@@ -203,14 +205,15 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
 
     def eval_init(key: Array, episodes: int) -> tuple:
         env_key, key = jax.random.split(key)
-        env_state, timestep = reset_envs(jax.random.split(env_key, episodes))
+        env_state = prepare_envs(jax.random.split(env_key, episodes))
         zeros = jnp.zeros((episodes,))
-        return (env_state, timestep, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), zeros > 0)
+        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), zeros > 0)
 
     def eval_steps(params: Any, carry: tuple, random: Array, frames: bool) -> tuple[tuple, Any]:
         def step(carry: tuple, _: None) -> tuple[tuple, Any]:
-            env_state, timestep, policy, key, returns, lengths, done = carry
+            env_state, policy, key, returns, lengths, done = carry
             key, act_key, random_key = jax.random.split(key, 3)
+            env_state, timestep = step_envs(env_state, policy.prev_action)
             policy, action = agent.act(params, policy, timestep, act_key, mode="mode")
             action = jnp.where(random, random_action(agent.spec.action, random_key, action.shape[0]), action)
             policy = policy._replace(prev_action=action)
@@ -219,19 +222,17 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
             lengths = lengths + counts.astype(jnp.int32)
             done = done | timestep.is_last
             seen = (timestep.obs["image"][0], counts[0]) if frames else None
-            env_state, timestep = step_envs(env_state, action)
-            return (env_state, timestep, policy, key, returns, lengths, done), seen
+            return (env_state, policy, key, returns, lengths, done), seen
 
         return jax.lax.scan(step, carry, None, length=config.chunk_steps)
 
-    eval_init_jit = jax.jit(eval_init, static_argnums=1)
     eval_steps_jit = jax.jit(eval_steps, static_argnums=3, donate_argnums=1)
 
     def evaluate(
         params: Any, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False
     ) -> Evaluation:
         record = frames and "image" in agent.spec.observation
-        carry, clips = eval_init_jit(key, episodes or config.eval_episodes), []
+        carry, clips = eval_init(key, episodes or config.eval_episodes), []
         while not bool(jnp.all(carry[-1])):
             carry, seen = eval_steps_jit(params, carry, jnp.asarray(random), record)
             if record:
@@ -240,7 +241,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         video = None
         if clips:
             video = np.concatenate(clips)
-        return Evaluation(carry[4], carry[5], video)
+        return Evaluation(carry[3], carry[4], video)
 
     return Loop(
         init=init,

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax import memory
+from ne_dreamer_jax import memory, shapes
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, EnvSpec, Latent, Transition
 
 SHARE = 0.9
@@ -84,7 +84,7 @@ def add(replay: Replay, transition: Transition) -> Replay:
     """
     rows = replay.data.reward.shape[0]
     step = transition._replace(latent=_compact(transition.latent, replay.data.latent.deter.dtype))
-    _check_equal(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), replay.data), step)
+    shapes.check(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), replay.data), step, "the replay")
     data = jax.tree.map(
         lambda ring, x: jax.lax.dynamic_update_index_in_dim(ring, x, replay.position, 0), replay.data, step
     )
@@ -155,7 +155,7 @@ def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
     rows, envs = replay.data.reward.shape
     new = _compact(latent, replay.data.latent.deter.dtype)
     expected = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*index.shape, *x.shape[2:]), x.dtype), replay.data.latent)
-    _check_equal(expected, new)
+    shapes.check(expected, new, "the replay")
     flat = index.reshape(-1)
     order = jnp.argsort(flat, stable=True)
     ordered = flat[order]
@@ -279,7 +279,7 @@ def _stored(example: Transition, num_envs: int, deter_dtype: Any) -> Transition:
     lead = () if example.reward.ndim == 0 else (num_envs,)
     kinds = {"reward": jnp.float32, "is_first": jnp.bool_, "is_last": jnp.bool_, "is_terminal": jnp.bool_}
     known = {name: jax.ShapeDtypeStruct(lead, dtype) for name, dtype in kinds.items()}
-    _check_equal(known, {name: getattr(example, name) for name in kinds})
+    shapes.check(known, {name: getattr(example, name) for name in kinds}, "the replay")
     for path, leaf in jax.tree.leaves_with_path(example):
         if leaf.shape[: len(lead)] != lead:
             name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -292,20 +292,3 @@ def _stored(example: Transition, num_envs: int, deter_dtype: Any) -> Transition:
 
 def _row_bytes(example: Transition, num_envs: int, deter_dtype: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(_stored(example, num_envs, deter_dtype)))
-
-
-def _check_equal(expected: Any, got: Any) -> None:
-    """Raises ValueError naming every leaf whose shape or dtype is not the expected one."""
-
-    def describe(tree: Any) -> dict[str, str]:
-        leaves = jax.tree.leaves_with_path(tree)
-        return {jax.tree_util.keystr(p, simple=True, separator="."): f"{x.dtype}{list(x.shape)}" for p, x in leaves}
-
-    want, have = describe(expected), describe(got)
-    wrong = [
-        f"{name}: expected {want.get(name, 'nothing')}, got {have.get(name, 'nothing')}"
-        for name in sorted(want.keys() | have.keys())
-        if want.get(name) != have.get(name)
-    ]
-    if wrong:
-        raise ValueError("does not fit the replay: " + "; ".join(wrong))

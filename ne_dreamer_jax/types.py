@@ -133,7 +133,7 @@ class Rollout(NamedTuple):
     latent: Latent  # [B, T, ...], sampled posterior
     feature: Array  # float32 [B, T, F], concat(flat stoch, deter)
     action: Array  # float32 [B, T, A], batch.action as the models see it (clipped, or one-hot)
-    prev_action: Array  # float32 [B, T, A], batch.prev_action likewise
+    prev_action: Array  # float32 [B, T, A], batch.prev_action likewise, zero where is_first
 
 
 class ReturnScale(NamedTuple):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from ne_dreamer_jax.losses import balanced_kl, symexp_bins, twohot_loss
 from ne_dreamer_jax.nets.heads import encode_action
 from ne_dreamer_jax.nets.networks import Networks
-from ne_dreamer_jax.nets.rssm import RSSM, feature, observe
+from ne_dreamer_jax.nets.rssm import RSSM, feature, mask_first, observe
 from ne_dreamer_jax.types import Array, Batch, Latent, Metrics, Params, PolicyState, Rollout, TimeStep
 
 LOSSES = ("dynamics", "representation", "reward", "continue")
@@ -34,6 +34,7 @@ class WorldModelConfig:
 def posterior_rollout(nets: Networks, params: Params, key: Array, batch: Batch) -> tuple[Rollout, Array]:
     """Encodes a batch and unrolls the posterior along it: the rollout, and the posterior's logits [B, T, S, K]."""
     action, prev_action = (encode_action(nets.spec.action, a) for a in (batch.action, batch.prev_action))
+    prev_action = mask_first(prev_action, batch.is_first)
     embedding = nets.apply("encoder", params, batch.obs)
     latent, logits = observe(nets.rssm, params["rssm"], key, batch.context, embedding, prev_action, batch.is_first)
     return Rollout(batch, embedding, latent, feature(latent), action, prev_action), logits
@@ -43,8 +44,7 @@ def posterior_step(nets: Networks, params: Params, key: Array, policy: PolicySta
     """The posterior after one more observation of N environments, for acting."""
     rssm = nets.rssm
     call = lambda method, *args: rssm.apply({"params": params["rssm"]}, *args, method=method)
-    prev_action = encode_action(nets.spec.action, policy.prev_action)
-    prev_action = jnp.where(timestep.is_first[:, None], 0.0, prev_action)
+    prev_action = mask_first(encode_action(nets.spec.action, policy.prev_action), timestep.is_first)
     uniform = jax.random.uniform(key, (*timestep.is_first.shape, rssm.config.stoch))
     observation_in = call(RSSM.embed_observation, nets.apply("encoder", params, timestep.obs))
     action_in = call(RSSM.embed_action, prev_action)

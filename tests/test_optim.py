@@ -76,7 +76,7 @@ def test_clipping_is_per_tensor_and_relative_to_its_norm():
     params = {"large": rng.normal(size=(5, 6)) * 100, "small": rng.normal(size=(5, 6)), "zero": np.zeros(7)}
     gradients = {"large": rng.normal(size=(5, 6)), "small": rng.normal(size=(5, 6)) * 9, "zero": rng.normal(size=7)}
     transform = clip_per_tensor(0.3, 1e-3)
-    f32 = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)  # noqa: E731
+    f32 = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
     got, _ = transform.update(f32(gradients), transform.init(params), f32(params))
     for name, gradient in gradients.items():
         limit = 0.3 * max(1e-3, np.linalg.norm(params[name]))

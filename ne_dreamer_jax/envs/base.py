@@ -7,6 +7,7 @@ simulations that stop being finite. Everything is written for ONE environment; `
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -60,7 +61,9 @@ class Env(NamedTuple):
     """An environment as pure functions, each for one environment and each jittable.
 
     ``reset(key) -> (EnvState, TimeStep)``; ``step(state, action) -> (EnvState, TimeStep)``;
-    ``observe(state) -> obs``, the observation of the state's time step over again.
+    ``observe(state) -> obs``, the observation of the state's time step over again;
+    ``prepare(key) -> EnvState``, a state from which the first ``step`` begins an episode. A program that starts there
+    needs no ``reset``, whose compilation costs as much as that of ``step``.
 
     After a time step with ``is_last`` the next ``step`` ignores its action and returns the first time step of a new
     episode (``is_first``, reward 0), started from a key never used before.
@@ -70,6 +73,7 @@ class Env(NamedTuple):
     reset: Callable[[Array], tuple[EnvState, TimeStep]]
     step: Callable[[EnvState, Array], tuple[EnvState, TimeStep]]
     observe: Callable[[EnvState], dict[str, Array]]
+    prepare: Callable[[Array], EnvState]
 
 
 def if_needed(needed: Array, compute: Callable[[], T], otherwise: T) -> T:
@@ -133,4 +137,13 @@ def from_core(core: Core) -> Env:
         stepped, progress = core.step(state.core, action, state.needs_reset, episode_key)
         return emit(stepped, key, state.faults, state.needs_reset, progress)
 
-    return Env(core.spec, reset, step, lambda state: core.observe(state.core))
+    @functools.cache
+    def core_shapes() -> CoreState:
+        return jax.eval_shape(core.reset, jax.random.key(0))
+
+    def prepare(key: Array) -> EnvState:
+        # What stands in the core is never used: a step from a state that needs a reset starts an episode.
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), core_shapes())
+        return EnvState(nothing, key, jnp.ones((), bool), jnp.zeros((), jnp.int32))
+
+    return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare)

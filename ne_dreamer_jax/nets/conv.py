@@ -1,30 +1,23 @@
 """Convolutions, lowered by platform.
 
-On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow on
-a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as matrix
-products over a few images at a time. The platform is the one that JAX would place new arrays on when the function is
-traced; a wrong guess (a program traced for another device than the default) costs speed, never correctness.
+On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
+on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
+matrix products over a few images at a time. The platform is the one that JAX would place new arrays on when the
+function is traced; a wrong guess (a program traced for another device than the default) costs speed, never correctness.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax.nets import cpu_conv
 from ne_dreamer_jax.nets.blocks import rms_norm
+from ne_dreamer_jax.nets.cpu_conv import Stage as Stage
 from ne_dreamer_jax.types import Array
-
-
-class Stage(NamedTuple):
-    """Parameters of one stage of the image encoder."""
-
-    kernel: Array  # float32 [k, k, C_in, C_out]
-    bias: Array  # float32 [C_out]
-    scale: Array  # float32 [C_out], of the RMSNorm
 
 
 def conv2d(x: Array, kernel: Array) -> Array:
@@ -40,7 +33,12 @@ def conv2d(x: Array, kernel: Array) -> Array:
         )
     if _on_cpu() and x.dtype == jnp.float32:
         return cpu_conv.conv2d(x, kernel)
-    return _plain_conv2d(x, kernel)
+    return lax_conv2d(x, kernel)
+
+
+def lax_conv2d(x: Array, kernel: Array) -> Array:
+    """`conv2d` as XLA has it."""
+    return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
 def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
@@ -59,27 +57,25 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
             f"them, got {list(images.shape)}. Resize the images or use fewer stages."
         )
     if _on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
-        return cpu_conv.encode_images(images, tuple(stages))
-    x = _normalise(images).astype(dtype)
+        return cpu_conv.encode_images(images, stages)
+    return lax_encode_images(images, stages, dtype)
+
+
+def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
+    """`encode_images` as a composition of XLA's own operations."""
+    x = (images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images).astype(dtype)
     for stage in stages:
-        x = _pool(_plain_conv2d(x, stage.kernel.astype(dtype))) + stage.bias.astype(dtype)[None, None, None]
+        x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
         x = jax.nn.silu(rms_norm(x, stage.scale))
     return x
 
 
 def _on_cpu() -> bool:
-    device = jax.config.jax_default_device  # a device, the name of a platform, or None
+    # A device, the name of a platform, or None.
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
     if device is None:
         return jax.default_backend() == "cpu"
     return getattr(device, "platform", device) == "cpu"
-
-
-def _normalise(images: Array) -> Array:
-    return images.astype(jnp.float32) / 255 - 0.5 if images.dtype == jnp.uint8 else images
-
-
-def _plain_conv2d(x: Array, kernel: Array) -> Array:
-    return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
 def _pool(x: Array) -> Array:

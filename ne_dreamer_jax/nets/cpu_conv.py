@@ -11,7 +11,9 @@ the four pooled outputs was the maximum; everything else is computed again.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,14 @@ from ne_dreamer_jax.nets.blocks import NORM_EPSILON
 from ne_dreamer_jax.types import Array
 
 _CHUNK_BYTES = 2**21
+
+
+class Stage(NamedTuple):
+    """Parameters of one stage of the image encoder."""
+
+    kernel: Array  # float32 [k, k, C_in, C_out]
+    bias: Array  # float32 [C_out]
+    scale: Array  # float32 [C_out], of the RMSNorm
 
 
 def encodes(kernel: Array) -> bool:
@@ -55,7 +65,7 @@ def _maximum_of_four(y: list[Array]) -> tuple[Array, Array]:
 
 
 def _where_maximum(which: Array, four: tuple[int, ...], g: Array) -> Array:
-    """g at the one of four positions, counted along the axes of shape ``four``, that was the maximum; zero elsewhere."""
+    """g at which of four positions was the maximum, zero at the others; ``four`` is the positions' shape, 4 in all."""
     # Compared as floats: LLVM vectorises that, and not the comparison of integers.
     return jnp.where(which.astype(jnp.float32) == jnp.arange(4.0).reshape(four), g, 0.0)
 
@@ -92,7 +102,7 @@ class _Winograd:
         d = winograd.transform_output_adjoint(y.reshape(16, S * T * n, -1))
         x = x.transpose(1, 2, 0, 3)
         dv, du = winograd.product_adjoints(winograd.transform_input(x), u, d)
-        return winograd.transform_input_adjoint(dv, x.shape).transpose(2, 0, 1, 3), du
+        return winograd.transform_input_adjoint(dv.reshape(64, -1, n, dv.shape[-1]), H, W).transpose(2, 0, 1, 3), du
 
 
 def _phase_table() -> np.ndarray:
@@ -234,16 +244,16 @@ def _stage_backward(residuals: Any, g: Array) -> Any:
 _stage.defvjp(_stage_forward, _stage_backward)
 
 
-def encode_images(images: Array, stages: Any) -> Array:
+def encode_images(images: Array, stages: Sequence[Stage]) -> Array:
     """`conv.encode_images` for kernels that `encodes` accepts, float32."""
-    x, scale = images, None
-    for kernel, bias, next_scale in stages:
-        x, scale = _stage(x, scale, kernel, bias), next_scale
-    return norm_silu(x, scale)
+    x = _stage(images, None, stages[0].kernel, stages[0].bias)
+    for before, stage in itertools.pairwise(stages):
+        x = _stage(x, before.scale, stage.kernel, stage.bias)
+    return norm_silu(x, stages[-1].scale)
 
 
 def _patches(x: Array, taps: int, before: int) -> Array:
-    """``[n, H, W, C]`` to ``[n, H, W, taps * taps * C]``, zero-padded by ``before`` rows and columns on the near side."""
+    """``[n, H, W, C]`` to ``[n, H, W, taps * taps * C]``, zero-padded ``before`` rows and columns on the near side."""
     _, H, W, _ = x.shape
     around = (before, taps - 1 - before)
     x = jnp.pad(x, ((0, 0), around, around, (0, 0)))
@@ -289,7 +299,7 @@ def _convolve_backward(x: Array, kernel: Array, before: int, g: Array) -> tuple[
     g = g.reshape(n, T, 4, S, 4, C_out).transpose(2, 4, 3, 1, 0, 5).reshape(16, S * T * n, C_out)
     v = winograd.transform_input(x.transpose(1, 2, 0, 3))
     dv, du = winograd.product_adjoints(v, winograd.transform_kernel(kernel), winograd.transform_output_adjoint(g))
-    dx = winograd.transform_input_adjoint(dv, (H, W, n, C_in)).transpose(2, 0, 1, 3)
+    dx = winograd.transform_input_adjoint(dv.reshape(64, -1, n, C_in), H, W).transpose(2, 0, 1, 3)
     return dx, winograd.transform_kernel_adjoint(du)
 
 

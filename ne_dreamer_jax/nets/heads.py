@@ -1,4 +1,4 @@
-"""Heads on features: reward, continue, value and policy. All take a feature as its parts, so that none is copied."""
+"""Heads on features: reward, continue, value and policy."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def model_action(action: ActionSpec, raw: Array) -> Array:
     """
     if isinstance(action, DiscreteAction):
         return raw
-    return raw + jax.lax.stop_gradient(jnp.clip(raw, -1.0, 1.0) - raw)
+    return jax.lax.stop_gradient(jnp.clip(raw, -1.0, 1.0)) + (raw - jax.lax.stop_gradient(raw))
 
 
 def encode_action(action: ActionSpec, env_action: Array) -> Array:

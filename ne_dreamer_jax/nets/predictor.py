@@ -29,6 +29,22 @@ class PredictorConfig:
     """A bias-free linear layer F to E before the tokens' own linear layer. Without it the function class is the
     same; what changes is the optimisation (the paper's w/o projector)."""
 
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ValueError(
+                f"objective.predictor.width must be a multiple of its heads, got {self.width} and {self.heads}; the "
+                f"nearest above is {-(-self.width // self.heads) * self.heads}."
+            )
+
+
+def check_length(config: PredictorConfig, length: int) -> None:
+    """Raises ValueError where a sequence of ``length`` steps exceeds the learned positions."""
+    if config.layers and length > config.positions:
+        raise ValueError(
+            f"Sequences of {length} steps, but the predictor has positions for {config.positions}. Shorten "
+            f"agent.batch_length or raise agent.objective.predictor.positions."
+        )
+
 
 def episode_causal_mask(is_first: Array, *, across_episodes: bool = False) -> Array:
     """Which tokens see which: bool [B, 2T, 2T] for the interleaved tokens state, action, state, action.
@@ -65,7 +81,8 @@ class TransformerLayer(nn.Module):
         c = self.config
         qkv = Linear(3 * c.width, dtype=self.dtype, name="qkv")(LayerNorm(self.dtype, name="attention_norm")(x))
         query, key, value = jnp.split(qkv.reshape(*x.shape[:-1], 3 * c.heads, c.width // c.heads), 3, axis=-2)
-        attended = jax.nn.dot_product_attention(query, key, value, mask=mask[:, None])
+        with jax.numpy_dtype_promotion("standard"):  # it promotes bfloat16 to float32 for the logits
+            attended = jax.nn.dot_product_attention(query, key, value, mask=mask[:, None])
         x = x + Linear(c.width, dtype=self.dtype, name="out")(attended.reshape(x.shape))
         y = Linear(c.feedforward, dtype=self.dtype, name="up")(LayerNorm(self.dtype, name="feedforward_norm")(x))
         return x + Linear(c.width, dtype=self.dtype, name="down")(nn.gelu(y, approximate=False))
@@ -104,11 +121,7 @@ class Predictor(nn.Module):
     def _attend(self, state: Array, act: Array, is_first: Array) -> Array:
         c = self.config
         batch, length, width = state.shape
-        if length > c.positions:
-            raise ValueError(
-                f"Sequences of {length} steps, but the predictor has positions for {c.positions}. Shorten "
-                f"agent.batch_length or raise agent.objective.predictor.positions."
-            )
+        check_length(c, length)
         x = jnp.stack([state, act], axis=2).reshape(batch, 2 * length, width)
         positions = self.param("positions", initializers.normal(0.02), (2 * c.positions, c.width), jnp.float32)
         x = x + positions[None, : 2 * length].astype(self.dtype)

@@ -76,7 +76,7 @@ def sample_onehot(uniform: Array, logits: Array) -> Array:
     probs = jax.nn.softmax(logits, axis=-1)
     below = jnp.cumsum(jax.lax.stop_gradient(probs), axis=-1)[..., :-1] <= uniform[..., None]
     sample = jax.nn.one_hot(jnp.sum(below, axis=-1), logits.shape[-1], dtype=probs.dtype)
-    return sample + probs - jax.lax.stop_gradient(probs)
+    return sample + (probs - jax.lax.stop_gradient(probs))  # in this order the value is one-hot to the bit
 
 
 class RSSM(nn.Module):

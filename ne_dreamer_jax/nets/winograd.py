@@ -34,7 +34,7 @@ _POINTS = np.array([0.0, 1.0, -1.0, 2.0, -2.0, 0.5, -0.5])  # and infinity
 
 def _matrices() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``A^T`` [4, 8], ``G`` [8, 5] and ``B^T`` [8, 8] by Toom-Cook interpolation at the points, float64."""
-    powers = lambda count: np.vander(_POINTS, count, increasing=True)  # noqa: E731
+    powers = lambda count: np.vander(_POINTS, count, increasing=True)
     out, kernel, data = np.zeros((TILE, WINDOW)), np.zeros((WINDOW, TAPS)), np.zeros((WINDOW, WINDOW))
     out[:, :-1], out[-1, -1] = powers(TILE).T, 1.0
     for row, point in enumerate(_POINTS):
@@ -59,11 +59,11 @@ def tiles(side: int) -> int:
 @functools.cache
 def _window_matrix(side: int) -> np.ndarray:
     """``[8 * T, side]``: B^T applied to every window along one zero-padded side, rows ordered (a, t)."""
-    padded = np.zeros((WINDOW, tiles(side), TILE * tiles(side) + WINDOW))
+    before = (TAPS - 1) // 2
+    padded = np.zeros((WINDOW, tiles(side), TILE * tiles(side) + WINDOW), np.float32)
     for t in range(tiles(side)):
         padded[:, t, TILE * t : TILE * t + WINDOW] = _DATA
-    before = (TAPS - 1) // 2
-    return padded[:, :, before : before + side].reshape(-1, side).astype(np.float32)
+    return padded[:, :, before : before + side].reshape(-1, side)
 
 
 def _over_rows(matrix: np.ndarray) -> np.ndarray:
@@ -87,28 +87,28 @@ def transform_input(x: Array) -> Array:
     """``B^T x B`` of every window: ``[H, W, n, C]`` to ``[64, S * T * n, C]``."""
     H, W, n, C = x.shape
     T, S = tiles(H), tiles(W)
-    rows = (_window_matrix(H) @ x.reshape(H, W * n * C)).reshape(WINDOW, T, W, n * C)
+    rows = jnp.matmul(_window_matrix(H), x.reshape(H, W * n * C)).reshape(WINDOW, T, W, n * C)
     rows = rows.transpose(0, 2, 1, 3).reshape(WINDOW, W, T * n * C)
-    return (_over_rows(_window_matrix(W)) @ rows).reshape(WINDOW**2, S * T * n, C)
+    return jnp.matmul(_over_rows(_window_matrix(W)), rows).reshape(WINDOW**2, S * T * n, C)
 
 
-def transform_input_adjoint(v: Array, shape: tuple[int, int, int, int]) -> Array:
-    """Gradient of the input, of the given ``[H, W, n, C]`` shape, from that of its transform."""
-    H, W, n, C = shape
+def transform_input_adjoint(v: Array, H: int, W: int) -> Array:
+    """Gradient of the input ``[H, W, n, C]`` from that of its transform, ``[64, S * T, n, C]``."""
+    _, _, n, C = v.shape
     T, S = tiles(H), tiles(W)
-    rows = _over_rows(_window_matrix(W).T) @ v.reshape(WINDOW, WINDOW * S, T * n * C)
+    rows = jnp.matmul(_over_rows(_window_matrix(W).T), v.reshape(WINDOW, WINDOW * S, T * n * C))
     rows = rows.reshape(WINDOW, W, T, n * C).transpose(0, 2, 1, 3).reshape(WINDOW * T, W * n * C)
-    return (_window_matrix(H).T @ rows).reshape(H, W, n, C)
+    return jnp.matmul(_window_matrix(H).T, rows).reshape(H, W, n, C)
 
 
 def transform_output(m: Array) -> Array:
     """``A^T m A``: ``[64, P, C_out]`` to ``[16, P, C_out]``, the outputs (i, j) of each of the P tiles."""
-    return (_OUT_2D @ m.reshape(WINDOW**2, -1)).reshape(TILE**2, *m.shape[1:])
+    return jnp.matmul(_OUT_2D, m.reshape(WINDOW**2, -1)).reshape(TILE**2, *m.shape[1:])
 
 
 def transform_output_adjoint(g: Array) -> Array:
     """Gradient in the transformed domain from that of the tiles' outputs: ``[16, P, C_out]`` to ``[64, P, C_out]``."""
-    return (_OUT_2D.T @ g.reshape(TILE**2, -1)).reshape(WINDOW**2, *g.shape[1:])
+    return jnp.matmul(_OUT_2D.T, g.reshape(TILE**2, -1)).reshape(WINDOW**2, *g.shape[1:])
 
 
 def product(v: Array, u: Array) -> Array:

@@ -17,6 +17,7 @@ class Sizes(NamedTuple):
     spec: EnvSpec
     feature: int  # F
     embedding: int  # E
+    length: int  # T
     dtype: Any  # of the matrix products
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import next_embedding_loss
-from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig
+from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
 from ne_dreamer_jax.objectives.base import Objective, Sizes, keep_target, no_target
 from ne_dreamer_jax.types import Array, DiscreteAction, Metrics, Params, Rollout
 
@@ -42,7 +42,15 @@ class NextEmbedding:
         return ("next_embedding",)
 
     def build(self, sizes: Sizes) -> Objective:
-        """The objective's functions, for networks of these sizes."""
+        """The objective's functions, for networks of these sizes.
+
+        Raises ValueError where sequences are too short for the shift, or too long for the predictor's positions.
+        """
+        if self.shift >= sizes.length:
+            raise ValueError(
+                f"objective.shift: expected less than agent.batch_length {sizes.length}, got {self.shift}."
+            )
+        check_length(self.predictor, sizes.length)
         discrete = isinstance(sizes.spec.action, DiscreteAction)
         predictor = Predictor(self.predictor, sizes.embedding, discrete, self.across_episodes, sizes.dtype)
 

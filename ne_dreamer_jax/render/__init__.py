@@ -8,7 +8,8 @@ import os
 # mujoco looks for an OpenGL library when it is imported, unless told that none is wanted.
 os.environ.setdefault("MUJOCO_GL", "disable")
 
+from ne_dreamer_jax.render.build import build
 from ne_dreamer_jax.render.picture import Overrides, draw
-from ne_dreamer_jax.render.scene import Scene, build
+from ne_dreamer_jax.render.scene import Scene
 
 __all__ = ["Overrides", "Scene", "build", "draw"]

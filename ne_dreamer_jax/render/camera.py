@@ -11,11 +11,10 @@ from ne_dreamer_jax.render.scene import Light, Scene
 
 
 class PlacedLight(NamedTuple):
-    """A light with its position in the world (scalars)."""
+    """A light and where it is in the world (scalars)."""
 
     light: Light
     position: Vec
-    direction: Vec
 
 
 def camera_position(scene: Scene, data: Any) -> Vec:
@@ -27,9 +26,9 @@ def place_lights(scene: Scene, data: Any) -> list[PlacedLight]:
     """The scene's lights, moved along with what they track."""
     placed = []
     for light in scene.lights:
-        position = jnp.asarray(light.position)
+        position = light.position
         if light.body:
             followed = data.subtree_com if light.tracks_com else data.xpos
-            position = position + jnp.asarray(followed, jnp.float32)[light.body]
-        placed.append(PlacedLight(light, Vec.of(position), Vec.of(light.direction)))
+            position = position + Vec.of(jnp.asarray(followed, jnp.float32)[light.body])
+        placed.append(PlacedLight(light, position))
     return placed

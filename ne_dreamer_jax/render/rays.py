@@ -35,7 +35,9 @@ class Vec:
         return Vec(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __mul__(self, scale: Any) -> Vec:
-        return Vec(self.x * scale, self.y * scale, self.z * scale)
+        """By a number, or component by component by a vector."""
+        by = scale if isinstance(scale, Vec) else Vec(scale, scale, scale)
+        return Vec(self.x * by.x, self.y * by.y, self.z * by.z)
 
     def __neg__(self) -> Vec:
         return Vec(-self.x, -self.y, -self.z)
@@ -77,13 +79,19 @@ class Shape:
     size: Vec
 
 
-def _signed_floor(value: Any) -> Any:
-    """``value``, but never so near zero that dividing by it overflows."""
+def away_from_zero(value: Any) -> Any:
+    """``value``, but never so near zero that dividing by it overflows float32."""
     return jnp.where(jnp.abs(value) < _TINY, _TINY, value)
 
 
 def capsule(shape: Shape, origin: Vec, direction: Vec) -> Array:
     """Capsule along the shape's z axis: ``size.x`` radius, ``size.y`` half length. Half length 0 is a sphere."""
+    t, hit = capsule_approach(shape, origin, direction)
+    return jnp.where(hit, t, MISS)
+
+
+def capsule_approach(shape: Shape, origin: Vec, direction: Vec) -> tuple[Array, Array]:
+    """Distance at which a ray enters a capsule, or comes nearest to its axis where it misses, and whether it hits."""
     axis, radius, half = shape.z, shape.size.x, shape.size.y
     offset = origin - shape.center
     # The infinite cylinder. Cross products keep float32 precise where the ray's origin is hundreds of radii away.
@@ -103,8 +111,7 @@ def capsule(shape: Shape, origin: Vec, direction: Vec) -> Array:
     t_end = (end * slope - facing - jnp.sqrt(jnp.maximum(discriminant_end, 0.0))) / length2
     on_side = jnp.abs(reach) <= half
     t = jnp.where(on_side, t_side, t_end)
-    hit = (discriminant > 0) & (on_side | (discriminant_end > 0)) & (t > 0)
-    return jnp.where(hit, t, MISS)
+    return t, (discriminant > 0) & (on_side | (discriminant_end > 0)) & (t > 0)
 
 
 def cylinder(shape: Shape, origin: Vec, direction: Vec) -> Array:
@@ -118,7 +125,7 @@ def cylinder(shape: Shape, origin: Vec, direction: Vec) -> Array:
     discriminant = radius * radius * a - gap * gap
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0)) / a
     middle = (along * slope - offset.dot(direction)) / a
-    inverse = 1.0 / _signed_floor(slope)
+    inverse = 1.0 / away_from_zero(slope)
     cap_middle, cap_half = -along * inverse, jnp.abs(half * inverse)
     t = jnp.maximum(middle - root, cap_middle - cap_half)
     hit = (discriminant > 0) & (t < jnp.minimum(middle + root, cap_middle + cap_half)) & (t > 0)
@@ -143,7 +150,7 @@ def box(shape: Shape, origin: Vec, direction: Vec) -> Array:
     offset = origin - shape.center
     enter, leave = [], []
     for axis, half in ((shape.x, shape.size.x), (shape.y, shape.size.y), (shape.z, shape.size.z)):
-        inverse = 1.0 / _signed_floor(direction.dot(axis))
+        inverse = 1.0 / away_from_zero(direction.dot(axis))
         middle, reach = -offset.dot(axis) * inverse, jnp.abs(half * inverse)
         enter.append(middle - reach)
         leave.append(middle + reach)
@@ -156,7 +163,7 @@ def plane(shape: Shape, origin: Vec, direction: Vec) -> Array:
     """The front of a rectangle of half sides ``size.x``, ``size.y`` (infinite where not positive), normal z."""
     offset = origin - shape.center
     height = offset.dot(shape.z)
-    t = -height / _signed_floor(direction.dot(shape.z))
+    t = -height / away_from_zero(direction.dot(shape.z))
     hit = (height > 0) & (t > 0)
     for axis, half in ((shape.x, shape.size.x), (shape.y, shape.size.y)):
         hit &= (half <= 0) | (jnp.abs(offset.dot(axis) + t * direction.dot(axis)) <= half)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ne_dreamer_jax.render.camera import PlacedLight
 from ne_dreamer_jax.render.rays import Array, Vec
-from ne_dreamer_jax.render.scene import Headlight
+from ne_dreamer_jax.render.scene import Headlight, Light
 
 
 class Reflected(NamedTuple):
@@ -44,36 +44,40 @@ def _reflect(
     to_light: Vec,
     normal: Vec,
     to_camera: Vec,
-    strength: Headlight | Any,
+    strength: Headlight | Light,
     specular: Any,
     shininess: Any,
     attenuation: Any = 1.0,
+    beside: Vec | None = None,
 ) -> Reflected:
     """Blinn's model with all vectors unit: diffuse N.L, specular (N.H)^shininess where N.L > 0."""
     facing = normal.dot(to_light)
+    diffuse = jnp.maximum(facing, 0.0)
+    if beside is not None:
+        diffuse = jnp.where(facing > 0, beside.dot(to_light), 0.0)
     half = (to_light + to_camera).unit()
     # Below 0.3 the power of any shininess in use is nothing; the floor keeps its squarings out of denormal numbers.
     shine = power(jnp.maximum(normal.dot(half), 0.3), shininess) * specular * strength.specular
     return Reflected(
-        diffuse=(strength.ambient + strength.diffuse * jnp.maximum(facing, 0.0)) * attenuation,
+        diffuse=(strength.ambient + strength.diffuse * diffuse) * attenuation,
         specular=jnp.where(facing > 0, shine, 0.0) * attenuation,
     )
 
 
 def headlight(
-    strength: Headlight, backwards: Vec, normal: Vec, to_camera: Vec, specular: Any, shininess: Any
+    strength: Headlight, backwards: Vec, normal: Vec, to_camera: Vec, specular: Any, shininess: Any, beside=None
 ) -> Reflected:
     """The headlight's contribution; ``backwards`` is the direction opposite to the camera's."""
-    return _reflect(backwards, normal, to_camera, strength, specular, shininess)
+    return _reflect(backwards, normal, to_camera, strength, specular, shininess, 1.0, beside)
 
 
 def scene_light(
-    placed: PlacedLight, point: Vec, normal: Vec, to_camera: Vec, specular: Any, shininess: Any
+    placed: PlacedLight, point: Vec, normal: Vec, to_camera: Vec, specular: Any, shininess: Any, beside=None
 ) -> Reflected:
     """One scene light's contribution at ``point``, unshadowed."""
     light = placed.light
     if light.directional:
-        return _reflect(-placed.direction, normal, to_camera, light, specular, shininess)
+        return _reflect(-light.direction, normal, to_camera, light, specular, shininess, 1.0, beside)
     offset = placed.position - point
     distance2 = offset.dot(offset)
     to_light = offset.unit()
@@ -82,7 +86,7 @@ def scene_light(
     if (constant, linear, quadratic) != (1.0, 0.0, 0.0):
         attenuation = 1.0 / (constant + linear * jnp.sqrt(distance2) + quadratic * distance2)
     if light.cutoff < 180:
-        cosine = -to_light.dot(placed.direction)
+        cosine = -to_light.dot(light.direction)
         spot = power(jnp.maximum(cosine, 0.0), light.exponent)
         attenuation = attenuation * jnp.where(cosine >= float(np.cos(np.deg2rad(light.cutoff))), spot, 0.0)
-    return _reflect(to_light, normal, to_camera, light, specular, shininess, attenuation)
+    return _reflect(to_light, normal, to_camera, light, specular, shininess, attenuation, beside)

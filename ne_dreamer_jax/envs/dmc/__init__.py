@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.envs.dmc.common import Episode, Task
-from ne_dreamer_jax.envs.dmc.simulation import Integrated, integrated, mjx
+from ne_dreamer_jax.envs.dmc.simulation import Integrated, integrated, mjx, substitute
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec
 
 _MAX_VALUE = 1e10  # MuJoCo's own bound (mjMAXVAL) beyond which a position or velocity counts as broken
@@ -64,7 +64,13 @@ def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core
 
         scene = render.build(simulation.mj_model, task.camera, height=image_size, width=image_size)
 
+    initial, no_action = simulation.initial(), jnp.zeros(simulation.mj_model.nu)
+    yes, no = jnp.ones((), bool), jnp.zeros((), bool)
+
     def reset(key: Array) -> State:
+        if task.coast:
+            blank = State(initial, task.episode, jnp.zeros((), jnp.int32))
+            return step(blank, no_action, yes, key)[0]
         start, episode = task.reset(key)
         return State(simulation.begin(start), episode, jnp.full((), time_limit, jnp.int32))
 
@@ -74,21 +80,29 @@ def core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core
             return integrated(start), episode
 
         start, episode = base.if_needed(restart, draw, (integrated(state.physics), state.episode))
-        steps_left = jnp.where(restart, time_limit, state.steps_left)
+        control = jnp.where(restart, 0.0, middle + half * action)
 
-        def control_step(_: Array, carry: tuple[mjx.Data, Array]) -> tuple[mjx.Data, Array]:
+        def control_step(number: Array, carry: tuple[mjx.Data, Array]) -> tuple[mjx.Data, Array]:
             data, reward = carry
-            data = simulation.advance(data, middle + half * action, restart, start)
+            if task.coast:
+                # From the drawn state but, as in dm_control, with the default state's forces in the first step.
+                data = substitute(data, restart & (number == 1), start)
+                data = simulation.advance(data, control, restart & (number == 0), integrated(initial))
+            else:
+                data = simulation.advance(data, control, restart, start)
             return data, reward + task.reward(data, episode)
 
         # Where the time limit is no multiple of the repeat, the last step of an episode is shorter.
-        repeat = action_repeat if time_limit % action_repeat == 0 else jnp.minimum(action_repeat, steps_left)
-        unrewarded = (state.physics, jnp.zeros((), jnp.float32))
-        data, reward = jax.lax.fori_loop(0, repeat, control_step, unrewarded)
-        steps_left = jnp.where(restart, time_limit, steps_left - repeat)
+        repeat: Any = action_repeat
+        if time_limit % action_repeat:
+            repeat = jnp.where(restart, action_repeat, jnp.minimum(action_repeat, state.steps_left))
+        turns = jnp.where(restart, 1 + task.coast, repeat) if task.coast else repeat
+        data, reward = jax.lax.fori_loop(0, turns, control_step, (state.physics, jnp.zeros((), jnp.float32)))
+        if task.coast:
+            data = data.replace(time=jnp.where(restart, 0.0, data.time))
+        steps_left = jnp.where(restart, time_limit, state.steps_left - repeat)
         sound = (jnp.abs(data.qpos) <= _MAX_VALUE).all() & (jnp.abs(data.qvel) <= _MAX_VALUE).all()
-        progress = base.Progress(reward, is_last=steps_left <= 0, is_terminal=jnp.zeros((), bool), is_sound=sound)
-        return State(data, episode, steps_left), progress
+        return State(data, episode, steps_left), base.Progress(reward, steps_left <= 0, is_terminal=no, is_sound=sound)
 
     def observe(state: State) -> dict[str, Array]:
         observation = {}

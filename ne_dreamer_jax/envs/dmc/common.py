@@ -25,6 +25,7 @@ class Task(NamedTuple):
     reward: Callable[[mjx.Data, Episode], Array]  # float32 []
     observe: Callable[[mjx.Data, Episode], dict[str, Array]]  # dm_control's observations, float32
     episode: Episode = ()  # an example, for shapes
+    coast: int = 0  # control steps without action from the first state on, before the episode begins
     camera: int = 0  # the camera whose pixels agents see
     pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data  # with what the episode moves, for drawing
 

@@ -32,6 +32,11 @@ def integrated(data: mjx.Data) -> Integrated:
     return {name: getattr(data, name) for name in ("time", "qpos", "qvel", "act", "qacc_warmstart")}
 
 
+def substitute(data: mjx.Data, where: Array, new: Integrated) -> mjx.Data:
+    """``data``, not settled, with its integrated fields replaced if ``where``."""
+    return data.replace(**jax.tree.map(lambda a, b: jnp.where(where, a, b), new, integrated(data)))
+
+
 def suite_directory() -> Path:
     """Where dm_control keeps the Control Suite's models; found without importing dm_control.
 
@@ -134,8 +139,7 @@ class Simulation:
         """
 
         def move(data: mjx.Data) -> mjx.Data:
-            moved = jax.tree.map(lambda new, old: jnp.where(restart, new, old), start, integrated(data))
-            settled = self.settle(data.replace(**moved))
+            settled = self.settle(substitute(data, restart, start))
             # In 64-bit mode MJX returns some integers wider than it takes them; a loop's carry has to keep its types.
             return jax.tree.map(lambda new, old: new.astype(old.dtype), settled, data)
 
