@@ -27,7 +27,7 @@ class Schedule:
         """The schedule of a run."""
         num_envs, repeat = config.loop.num_envs, config.env.action_repeat
         evaluation = max(1, round(config.loop.eval_every / (num_envs * repeat)))
-        return cls(loop.vector_steps, config.loop.chunk_steps, evaluation, num_envs, repeat)
+        return cls(loop.vector_steps, loop.chunk_steps, evaluation, num_envs, repeat)
 
     def end_of_chunk(self, step: int) -> int:
         """Where the chunk that starts at a step ends."""

@@ -6,7 +6,7 @@ Each part's dataclass lives beside the code that reads it; this module composes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -120,26 +120,20 @@ def preset(name: str, size: str | None = None) -> Config:
 
 
 def with_method(config: Config, method: str) -> Config:
-    """The config with another of the paper's methods, and the weight of its objective's losses."""
+    """The config with another of the paper's methods; what the methods share stays as the config has it."""
     _check("method", method, METHODS)
-    objective, weights = METHODS[method]
-    own = set(config.agent.objective.losses)
-    scales = {name: scale for name, scale in config.agent.loss_scales.items() if name not in own}
-    agent = replace(config.agent, objective=objective, loss_scales={**scales, **weights})
+    agent = replace(config.agent, objective=METHODS[method](config.agent.objective))
     return replace(config, agent=agent, method=method)
 
 
-_full = objectives.NextEmbedding()
-METHODS: dict[str, tuple[Any, dict[str, float]]] = {
-    "ne_dreamer": (_full, {"next_embedding": 1.0}),
-    "ne_dreamer/no_transformer": (
-        replace(_full, predictor=replace(_full.predictor, layers=0)),
-        {"next_embedding": 1.0},
-    ),
-    "ne_dreamer/no_shift": (replace(_full, shift=0), {"next_embedding": 1.0}),
-    "ne_dreamer/no_projector": (
-        replace(_full, predictor=replace(_full.predictor, projector=False)),
-        {"next_embedding": 1.0},
-    ),
+def _with_predictor(objective: objectives.NextEmbedding, **changes: Any) -> objectives.NextEmbedding:
+    return replace(objective, predictor=replace(objective.predictor, **changes))
+
+
+METHODS: dict[str, Callable[[Any], Any]] = {
+    "ne_dreamer": lambda objective: objective,
+    "ne_dreamer/no_transformer": lambda objective: _with_predictor(objective, layers=0),
+    "ne_dreamer/no_shift": lambda objective: replace(objective, shift=0),
+    "ne_dreamer/no_projector": lambda objective: _with_predictor(objective, projector=False),
 }
-"""Method -> its objective and the weights of the objective's losses (the paper's table)."""
+"""Method -> its objective, made from the full method's."""

@@ -20,6 +20,7 @@ from ne_dreamer_jax import replay as replay_lib
 from ne_dreamer_jax.types import Array, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
 
 PAPER_CAPACITY = 5_000_000
+CHUNK_UPDATES = 64  # between two of these the host can neither report, save nor stop
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class LoopConfig:
     prefill: int = 4_096
     """Agent steps before the first update."""
     chunk_steps: int = 64
-    """Vector steps (agent steps of each environment) of one call to the device."""
+    """Vector steps (agent steps of each environment) of one call to the device, unless that is too many updates."""
     eval_every: int = 50_000
     """Environment steps between evaluations."""
     eval_episodes: int = 10
@@ -95,6 +96,8 @@ class Loop(NamedTuple):
     """What replay will allocate."""
     capacity: int
     """Transitions that replay will hold."""
+    chunk_steps: int
+    """Vector steps of one chunk: as configured, but no more than about `CHUNK_UPDATES` updates."""
     vector_steps: int
     """Vector steps of the whole run."""
     updates: int
@@ -109,6 +112,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     n, b, length = config.num_envs, agent.config.batch_size, agent.config.batch_length
     vector_steps = -(-config.env_steps // (n * action_repeat))
     ratio = Fraction(config.replay_ratio).limit_denominator(1_000)
+    if ratio == 0:
+        raise ValueError(f"loop.replay_ratio: expected at least 0.001, got {config.replay_ratio}")
     price = b * length * ratio.denominator  # of one update, in units of credit
     wage = n * ratio.numerator  # of one vector step
     prefill = max(-(-config.prefill // n), length + 1)
@@ -169,7 +174,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         replay = replay_lib.add(state.replay, transition(timestep, policy, action))
 
         ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
-        steps = jnp.where(timestep.is_first, 0, state.episodes.length) + 1
+        steps = jnp.where(timestep.is_first, 0, state.episodes.length + 1)
         ended = timestep.is_last
         episode_sums = {
             "return": episode_sums["return"] + jnp.sum(jnp.where(ended, ret, 0.0)),
@@ -219,7 +224,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
             policy = policy._replace(prev_action=action)
             counts = ~done
             returns = returns + jnp.where(counts, timestep.reward, 0.0)
-            lengths = lengths + counts.astype(jnp.int32)
+            lengths = lengths + (counts & ~timestep.is_first).astype(jnp.int32)
             done = done | timestep.is_last
             seen = (timestep.obs["image"][0], counts[0]) if frames else None
             return (env_state, policy, key, returns, lengths, done), seen
@@ -249,6 +254,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         evaluate=evaluate,
         replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
         capacity=capacity,
+        chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // wage)),
         vector_steps=vector_steps,
         updates=updates,
     )

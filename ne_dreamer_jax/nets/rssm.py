@@ -94,15 +94,15 @@ class RSSM(nn.Module):
         self.stoch_in = Block(c.hidden, self.dtype)
         self.action_in = Block(c.hidden, self.dtype)
         # A block's linear layer reads its own D / blocks of the state and all three inputs. The two shares are kept
-        # apart: the second is one dense product. Both are drawn with the fan in of the whole.
-        std = (1 / (block + 3 * c.hidden)) ** 0.5
+        # apart: the second is one dense product. As in DreamerV3, the fan in of a block-linear layer counts the inputs
+        # of all blocks.
+        std = (1 / (c.blocks * (block + 3 * c.hidden))) ** 0.5
         init = initializers.truncated_normal(std / 0.87962566103423978)
         self.state_kernel = self.param("state_kernel", init, (c.blocks, block, block), jnp.float32)
         self.input_kernel = self.param("input_kernel", init, (3 * c.hidden, c.deter), jnp.float32)
         self.hidden_bias = self.param("hidden_bias", initializers.zeros_init(), (c.deter,), jnp.float32)
         self.hidden_norm = RMSNorm()
-        gates = initializers.variance_scaling(1.0, "fan_in", "truncated_normal", batch_axis=(0,))
-        self.gate_kernel = self.param("gate_kernel", gates, (c.blocks, block, 3 * block), jnp.float32)
+        self.gate_kernel = self.param("gate_kernel", kernel_init(), (c.blocks, block, 3 * block), jnp.float32)
         self.gate_bias = self.param("gate_bias", initializers.zeros_init(), (c.blocks, 3 * block), jnp.float32)
         self.posterior_kernel = self.param(
             "posterior_kernel", kernel_init(), (c.deter + self.embedding, c.hidden), jnp.float32

@@ -63,7 +63,14 @@ def build(config, *, image: bool = True) -> training.Run:
 
     agent = SimpleNamespace(spec=EnvSpec(observation, ContinuousAction(1)))
     loop = Loop(
-        init, chunk, evaluate, replay_bytes=total * n, capacity=total * n, vector_steps=total, updates=total - prefill
+        init,
+        chunk,
+        evaluate,
+        replay_bytes=total * n,
+        capacity=total * n,
+        chunk_steps=config.loop.chunk_steps,
+        vector_steps=total,
+        updates=total - prefill,
     )
     return training.Run(config, agent, loop, jax.eval_shape(init, jax.random.key(0)))  # type: ignore[arg-type]
 

@@ -50,9 +50,14 @@ def suite_directory() -> Path:
 
 
 @contextlib.contextmanager
-def _implicit_promotion() -> Iterator[None]:
-    """MJX relies on implicit promotion; this allows it while MJX is traced, whatever the caller's configuration."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+def _mjx_numerics() -> Iterator[None]:
+    """What MJX is traced under, whatever the caller's configuration.
+
+    It relies on implicit promotion, and its solver on float32 products: the three digits of TensorFloat-32, a GPU's
+    default, would take its trajectories away from MuJoCo's.
+    """
+    promotion = (jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"))
+    with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
         yield
 
 
@@ -110,13 +115,13 @@ class Simulation:
 
     def in_contact(self, data: mjx.Data) -> Array:
         """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
-        with _implicit_promotion():
+        with _mjx_numerics():
             contact = mjx.collision(self.model, mjx.kinematics(self.model, data))._impl.contact
             return (contact.dist < contact.includemargin).any()
 
     def settle(self, data: mjx.Data) -> mjx.Data:
         """Brings all that depends on positions and velocities, but for sensors, up to date."""
-        with _implicit_promotion():
+        with _mjx_numerics():
             return mjx.fwd_velocity(self.model, mjx.fwd_position(self.model, data))
 
     def begin(self, data: mjx.Data) -> mjx.Data:
@@ -145,7 +150,7 @@ class Simulation:
 
         def euler(_: Array, data: mjx.Data) -> mjx.Data:
             data = self._accelerate(data, passive=restart)
-            with _implicit_promotion():
+            with _mjx_numerics():
                 return move(mjx.euler(self.model, data))
 
         def runge_kutta(_: Array, data: mjx.Data) -> mjx.Data:
@@ -157,7 +162,7 @@ class Simulation:
 
     def _accelerate(self, data: mjx.Data, passive: Array) -> mjx.Data:
         """Forces, constraints and the sensors that need them; where ``passive`` without the actuators' forces."""
-        with _implicit_promotion():
+        with _mjx_numerics():
             data = mjx.fwd_actuation(self.model, data)
             data = data.replace(qfrc_actuator=jnp.where(passive, 0.0, data.qfrc_actuator))
             data = mjx.fwd_acceleration(self.model, data)
@@ -167,7 +172,7 @@ class Simulation:
 
     def _sense(self, data: mjx.Data) -> mjx.Data:
         """Reads the sensors that need positions and velocities alone."""
-        with _implicit_promotion():
+        with _mjx_numerics():
             return mjx.sensor_vel(self.model, mjx.sensor_pos(self.model, data))
 
     def sensor(self, name: str) -> slice:
