@@ -17,6 +17,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from ne_dreamer_jax.types import Array
 
@@ -111,7 +112,9 @@ class Simulation:
         """The model's default state, at rest and settled."""
         data = mujoco.MjData(self.mj_model)
         mujoco.mj_step1(self.mj_model, data)
-        return mjx.put_data(self.mj_model, data)
+        # What no stage has computed yet is uninitialised memory, and may hold what no float32 can.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return mjx.put_data(self.mj_model, data)
 
     def in_contact(self, data: mjx.Data) -> Array:
         """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
