@@ -85,7 +85,7 @@ def test_the_model_its_timing_and_its_names_are_dm_controls(name):
     exempt = {"names", "paths", *per_episode.get(domain, []), *dropped_contacts.get(domain, [])}
     compared = 0
     for field in dir(model):
-        value = getattr(model, field) if not field.startswith(("_", "name_")) and field not in exempt else None
+        value = getattr(model, field) if not field.startswith(("_", "name")) and field not in exempt else None
         if isinstance(value, np.ndarray) and value.dtype.kind in "iufb" and "_bvh" not in field and "bvh_" not in field:
             np.testing.assert_allclose(getattr(simulation.mj_model, field), value, rtol=1e-6, err_msg=field)
             compared += 1
