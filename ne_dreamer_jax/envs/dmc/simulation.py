@@ -141,7 +141,7 @@ class Simulation:
 
         Args:
           data: settled, as is what is returned.
-          control: float32 [nu], in the actuators' units.
+          control: float32 [nu], in the actuators' units; zero where ``restart``.
           restart: bool [].
           start: of the new episode.
         """
@@ -160,8 +160,8 @@ class Simulation:
             return _runge_kutta(data, self.mj_model.opt.timestep, lambda data: self._accelerate(data, restart), move)
 
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        data = data.replace(ctrl=jnp.where(restart, 0.0, control))
-        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, runge_kutta if rk4 else euler, data))
+        sub_step = runge_kutta if rk4 else euler
+        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, sub_step, data.replace(ctrl=control)))
 
     def _accelerate(self, data: mjx.Data, passive: Array) -> mjx.Data:
         """Forces, constraints and the sensors that need them; where ``passive`` without the actuators' forces."""
