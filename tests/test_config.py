@@ -202,7 +202,7 @@ def networks(config):
 
 
 def acting(agent, spec):
-    made, step = make_agent(agent, spec), tiny.batch(spec, (1, 1))
+    made, step = make_agent(agent, spec), tiny.batch(spec, (1, 1), first=[(0, 0)])
     step = jax.tree.map(lambda x: x[:, 0], step._replace(context=None))
     params = jax.eval_shape(tiny.networks(spec, agent).init, KEY)
     return program(lambda params: made.act(params, made.init_policy(1), step, KEY), params)
