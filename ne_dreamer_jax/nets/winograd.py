@@ -34,7 +34,7 @@ _POINTS = np.array([0.0, 1.0, -1.0, 2.0, -2.0, 0.5, -0.5])  # and infinity
 
 def _matrices() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``A^T`` [4, 8], ``G`` [8, 5] and ``B^T`` [8, 8] by Toom-Cook interpolation at the points, float64."""
-    powers = lambda count: np.vander(_POINTS, count, increasing=True)  # noqa: E731
+    powers = lambda count: np.vander(_POINTS, count, increasing=True)
     out, kernel, data = np.zeros((TILE, WINDOW)), np.zeros((WINDOW, TAPS)), np.zeros((WINDOW, WINDOW))
     out[:, :-1], out[-1, -1] = powers(TILE).T, 1.0
     for row, point in enumerate(_POINTS):
