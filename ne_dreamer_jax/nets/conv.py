@@ -4,6 +4,9 @@ On accelerators these are `lax.conv_general_dilated` and plain compositions arou
 on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
 matrix products over a few images at a time. The platform is the one that JAX would place new arrays on when the
 function is traced; a wrong guess (a program traced for another device than the default) costs speed, never correctness.
+
+On several CPU devices wrap the call in `jax.shard_map` over the images: the loop over chunks of a global array would
+otherwise run whole on every device.
 """
 
 from __future__ import annotations

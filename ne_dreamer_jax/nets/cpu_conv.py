@@ -23,7 +23,7 @@ from ne_dreamer_jax.nets import winograd
 from ne_dreamer_jax.nets.blocks import NORM_EPSILON
 from ne_dreamer_jax.types import Array
 
-_CHUNK_BYTES = 2**21
+_CHUNK_BYTES = 2**21  # what the largest array about a chunk of images may take: a few of them fit a cache of some MB
 
 
 class Stage(NamedTuple):
@@ -260,12 +260,40 @@ def _patches(x: Array, taps: int, before: int) -> Array:
     return jnp.concatenate([x[:, i : i + H, j : j + W] for i in range(taps) for j in range(taps)], axis=-1)
 
 
-def _flip(kernel: Array) -> Array:
-    return jnp.flip(kernel, (0, 1)).swapaxes(2, 3)
-
-
 def _winograd_suits(kernel: Array) -> bool:
     return kernel.shape[:2] == (5, 5) and kernel.shape[2] > 4
+
+
+def _prepare(kernel: Array) -> Array:
+    return winograd.transform_kernel(kernel) if _winograd_suits(kernel) else kernel
+
+
+def _convolve(x: Array, u: Array, kernel: Array, before: int) -> Array:
+    """A few images ``[n, H, W, C_in]`` to ``[n, H, W, C_out]``, with the kernel as from `_prepare` and as it is."""
+    n, H, W, _ = x.shape
+    C_out = kernel.shape[3]
+    if not _winograd_suits(kernel):
+        return _patches(x, kernel.shape[0], before) @ u.reshape(-1, C_out)
+    T, S = winograd.tiles(H), winograd.tiles(W)
+    y = winograd.transform_output(winograd.product(winograd.transform_input(x.transpose(1, 2, 0, 3)), u))
+    y = y.reshape(4, 4, S, T, n, C_out).transpose(4, 3, 0, 2, 1, 5)
+    return y.reshape(n, 4 * T, 4 * S, C_out)[:, :H, :W]
+
+
+def _convolve_backward(x: Array, u: Array, kernel: Array, before: int, g: Array) -> tuple[Array, Array]:
+    """Gradients of x and of the prepared kernel for a few images."""
+    n, H, W, C_in = x.shape
+    taps, _, _, C_out = kernel.shape
+    if not _winograd_suits(kernel):
+        dkernel = _patches(x, taps, before).reshape(-1, taps * taps * C_in).T @ g.reshape(-1, C_out)
+        flipped = jnp.flip(u, (0, 1)).swapaxes(2, 3).reshape(-1, C_in)
+        return _patches(g, taps, taps - 1 - before) @ flipped, dkernel.reshape(kernel.shape)
+    T, S = winograd.tiles(H), winograd.tiles(W)
+    g = jnp.pad(g, ((0, 0), (0, 4 * T - H), (0, 4 * S - W), (0, 0)))
+    g = g.reshape(n, T, 4, S, 4, C_out).transpose(2, 4, 3, 1, 0, 5).reshape(16, S * T * n, C_out)
+    v, d = winograd.transform_input(x.transpose(1, 2, 0, 3)), winograd.transform_output_adjoint(g)
+    dv, du = winograd.product_adjoints(v, u, d)
+    return winograd.transform_input_adjoint(dv.reshape(64, -1, n, C_in), H, W).transpose(2, 0, 1, 3), du
 
 
 def _conv2d_bytes(x: Array, kernel: Array) -> int:
@@ -274,41 +302,12 @@ def _conv2d_bytes(x: Array, kernel: Array) -> int:
     return 4 * x.shape[1] * x.shape[2] * kernel.shape[0] ** 2 * max(kernel.shape[2:])
 
 
-def _convolve(x: Array, kernel: Array, before: int) -> Array:
-    """One chunk ``[n, H, W, C_in]`` to ``[n, H, W, C_out]``."""
-    taps, _, _, C_out = kernel.shape
-    n, H, W, _ = x.shape
-    if not _winograd_suits(kernel):
-        return _patches(x, taps, before) @ kernel.reshape(-1, C_out)
-    T, S = winograd.tiles(H), winograd.tiles(W)
-    v = winograd.transform_input(x.transpose(1, 2, 0, 3))
-    y = winograd.transform_output(winograd.product(v, winograd.transform_kernel(kernel)))
-    y = y.reshape(4, 4, S, T, n, C_out).transpose(4, 3, 0, 2, 1, 5)
-    return y.reshape(n, 4 * T, 4 * S, C_out)[:, :H, :W]
-
-
-def _convolve_backward(x: Array, kernel: Array, before: int, g: Array) -> tuple[Array, Array]:
-    """One chunk's gradients of x and of the kernel."""
-    taps, _, C_in, C_out = kernel.shape
-    n, H, W, _ = x.shape
-    if not _winograd_suits(kernel):
-        dkernel = _patches(x, taps, before).reshape(-1, taps * taps * C_in).T @ g.reshape(-1, C_out)
-        return _convolve(g, _flip(kernel), taps - 1 - before), dkernel.reshape(kernel.shape)
-    T, S = winograd.tiles(H), winograd.tiles(W)
-    g = jnp.pad(g, ((0, 0), (0, 4 * T - H), (0, 4 * S - W), (0, 0)))
-    g = g.reshape(n, T, 4, S, 4, C_out).transpose(2, 4, 3, 1, 0, 5).reshape(16, S * T * n, C_out)
-    v = winograd.transform_input(x.transpose(1, 2, 0, 3))
-    dv, du = winograd.product_adjoints(v, winograd.transform_kernel(kernel), winograd.transform_output_adjoint(g))
-    dx = winograd.transform_input_adjoint(dv.reshape(64, -1, n, C_in), H, W).transpose(2, 0, 1, 3)
-    return dx, winograd.transform_kernel_adjoint(du)
-
-
 @jax.custom_vjp
 def conv2d(x: Array, kernel: Array) -> Array:
     """`conv.conv2d` in float32."""
-    before = (kernel.shape[0] - 1) // 2
+    u, before = _prepare(kernel), (kernel.shape[0] - 1) // 2
     chunks = _split(x, _conv2d_bytes(x, kernel))
-    return _join(jax.lax.map(lambda chunk: _convolve(chunk, kernel, before), chunks), x.shape[0])
+    return _join(jax.lax.map(lambda chunk: _convolve(chunk, u, kernel, before), chunks), x.shape[0])
 
 
 def _conv2d_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -317,14 +316,15 @@ def _conv2d_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]
 
 def _conv2d_backward(residuals: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
     x, kernel = residuals
-    before = (kernel.shape[0] - 1) // 2
+    u, before = _prepare(kernel), (kernel.shape[0] - 1) // 2
 
     def body(total: Array, chunk: tuple[Array, Array]) -> tuple[Array, Array]:
-        dx, dkernel = _convolve_backward(chunk[0], kernel, before, chunk[1])
-        return total + dkernel, dx
+        dx, du = _convolve_backward(chunk[0], u, kernel, before, chunk[1])
+        return total + du, dx
 
     size = _conv2d_bytes(x, kernel)
-    dkernel, dx = jax.lax.scan(body, jnp.zeros_like(kernel), (_split(x, size), _split(g, size)))
+    du, dx = jax.lax.scan(body, jnp.zeros_like(u), (_split(x, size), _split(g, size)))
+    dkernel = winograd.transform_kernel_adjoint(du) if _winograd_suits(kernel) else du
     return _join(dx, x.shape[0]), dkernel
 
 

@@ -93,3 +93,47 @@ def test_encoder_equals_its_definition(shape, channels):
     _assert_close(
         _with_gradients(conv.encode_images, g, images, stages), _with_gradients(_reference, g, images, stages)
     )
+
+
+def test_uint8_images_are_centred_and_kernels_get_their_gradients():
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), np.uint8)
+    stages, g = _stages((3, 4, 6)), _normal(2, 3, 2, 2, 6)
+    actual = _with_gradients(lambda stages: conv.encode_images(jnp.asarray(images), stages), g, stages)
+    centred = jnp.asarray(images.astype(np.float32) / 255 - 0.5)
+    _assert_close(actual, _with_gradients(lambda stages: _reference(centred, stages), g, stages))
+
+
+@pytest.mark.parametrize(("taps", "dtype", "tolerance"), [(3, jnp.float32, 3e-5), (5, jnp.bfloat16, 5e-2)])
+def test_encoder_without_a_lowering_of_its_own_is_xlas(taps, dtype, tolerance):
+    stages, images = _stages((3, 4, 6), taps), _normal(0, 2, 8, 8, 3)
+    y = conv.encode_images(images, stages, dtype)
+    assert y.dtype == dtype
+    _assert_close(y.astype(jnp.float32), _reference(images, stages), tolerance)
+
+
+def test_bfloat16_convolution():
+    x, kernel = (_normal(0, 2, 6, 6, 5) / 8).astype(jnp.bfloat16), _normal(1, 5, 5, 5, 6).astype(jnp.bfloat16)
+    y = conv.conv2d(x, kernel)
+    assert y.dtype == jnp.bfloat16
+    _assert_close(y.astype(jnp.float32), _lax_conv(x.astype(jnp.float32), kernel.astype(jnp.float32)), 1e-2)
+
+
+def test_gradient_steps_in_a_loop_over_several_seeds_equal_single_ones():
+    images = _normal(0, 5, 8, 8, 3)
+    gradient = jax.grad(lambda stages: jnp.mean(conv.encode_images(images, stages) ** 2))
+
+    def step(stages):
+        return jax.tree.map(lambda p, g: p - 0.1 * g, stages, gradient(stages))
+
+    seeds = [_stages((3, 4, 6)), [stage._replace(kernel=-stage.kernel) for stage in _stages((3, 4, 6))]]
+    together = jax.jit(jax.vmap(lambda stages: jax.lax.fori_loop(0, 2, lambda _, s: step(s), stages)))
+    single = jax.jit(step)
+    expected = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(single(single(stages)) for stages in seeds))
+    _assert_close(together(jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)), expected)
+
+
+def test_messages_say_what_was_expected():
+    with pytest.raises(ValueError, match=r"Expected x \[N, H, W, C_in\].*got float32 \[1, 4, 4, 3\]"):
+        conv.conv2d(jnp.zeros((1, 4, 4, 3)), jnp.zeros((5, 5, 4, 2)))
+    with pytest.raises(ValueError, match=r"multiples of 4.*\[1, 6, 8, 3\]"):
+        conv.encode_images(jnp.zeros((1, 6, 8, 3)), _stages((3, 4, 6)))
