@@ -57,6 +57,13 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         return axes @ np.stack([right.ravel(), up.ravel(), -np.ones(height * width)])
 
     center = rays(0.5, 0.5)
+    ground = None if floor_id is None else _floor(model, floor_id)
+    views = [np.eye(3)]
+    if ground is not None and ground.reflectance > 0:
+        normal = np.array([ground.normal.x, ground.normal.y, ground.normal.z])
+        views.append(np.eye(3) - 2 * np.outer(normal, normal))
+    center_rays = np.stack([view @ center for view in views], 1)
+    sample_rays = np.stack([np.stack([view @ rays(x, y) for x, y in SAMPLES], 1) for view in views], 1)
     groups = _groups(model, floor_id)
     specular, shininess = _common_material(model, groups)
     scene = Scene(
@@ -66,8 +73,8 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         right=_floats(axes[:, 0]),
         up=_floats(axes[:, 1]),
         backwards=_floats(axes[:, 2]),
-        center_rays=Vec(*center.astype(np.float32)),
-        sample_rays=Vec(*np.stack([rays(x, y) for x, y in SAMPLES], 1).astype(np.float32)),
+        center_rays=Vec(*center_rays.astype(np.float32)),
+        sample_rays=Vec(*sample_rays.astype(np.float32)),
         pixel_size=pixel_size,
         sky=Vec(*texture.skybox(model, center, axes[:, 0] * pixel_size, -axes[:, 1] * pixel_size).astype(np.float32)),
         groups=groups,
@@ -78,7 +85,7 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         lights=tuple(_light(model, i) for i in range(model.nlight) if model.light_active[i]),
         shadow_clip=float(model.stat.extent * model.vis.map.shadowclip),
         shadow_scale=float(model.vis.map.shadowscale),
-        floor=None if floor_id is None else _floor(model, floor_id),
+        floor=ground,
     )
     stands_still = model.cam_mode[camera_id] == _FIXED and not any(light.body for light in scene.lights)
     if scene.floor is None or not stands_still:
@@ -105,7 +112,9 @@ def _material(model: mujoco.MjModel, material: int, rgba: np.ndarray) -> tuple[n
 def _drawn(model: mujoco.MjModel, what: str) -> list[int]:
     """Ids of the geoms or sites (``what``) that are seen at all."""
     group, rgba, material = (getattr(model, f"{what}_{field}") for field in ("group", "rgba", "matid"))
-    return [i for i in range(len(group)) if group[i] < _DRAWN_GROUPS and _material(model, material[i], rgba[i])[0][3] > 0]
+    return [
+        i for i in range(len(group)) if group[i] < _DRAWN_GROUPS and _material(model, material[i], rgba[i])[0][3] > 0
+    ]
 
 
 def _floor_id(model: mujoco.MjModel) -> int | None:

@@ -186,7 +186,4 @@ def look_up(texture: Checker, u: Array, v: Array, footprint: Array) -> Vec:
     level = sample(fine)
     level = (level + (sample(fine + 1) - level) * blend) * (1 / 255)
     low, high = texture.low, texture.high
-    return Vec(
-        low.x + level * (high.x - low.x), low.y + level * (high.y - low.y), low.z + level * (high.z - low.z)
-    )
-
+    return Vec(low.x + level * (high.x - low.x), low.y + level * (high.y - low.y), low.z + level * (high.z - low.z))
