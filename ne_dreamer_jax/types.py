@@ -122,7 +122,7 @@ class Batch(NamedTuple):
     is_last: Array  # bool [B, T]
     is_terminal: Array  # bool [B, T]
     context: Latent  # [B, ...], the replayed latent one step before obs[:, 0]; ignored where is_first[:, 0]
-    index: Array  # int32 [B, T], where the steps lie in replay, for write_latents
+    index: Array  # type: ignore[assignment]  # int32 [B, T], where the steps lie in replay (hides tuple.index)
 
 
 class Rollout(NamedTuple):
@@ -133,7 +133,7 @@ class Rollout(NamedTuple):
     latent: Latent  # [B, T, ...], sampled posterior
     feature: Array  # float32 [B, T, F], concat(flat stoch, deter)
     action: Array  # float32 [B, T, A], batch.action as the models see it (clipped, or one-hot)
-    prev_action: Array  # float32 [B, T, A], batch.prev_action likewise
+    prev_action: Array  # float32 [B, T, A], batch.prev_action likewise, zero where is_first
 
 
 class ReturnScale(NamedTuple):

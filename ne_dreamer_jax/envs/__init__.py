@@ -1,0 +1,30 @@
+"""Environments that run on the accelerator beside the learner.
+
+``names`` and the check of a mistyped name load neither JAX nor MuJoCo; ``make`` does.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ne_dreamer_jax.envs.registry import check, names, split_dmc
+
+if TYPE_CHECKING:
+    from ne_dreamer_jax.envs.base import Env
+
+__all__ = ["check", "make", "names"]
+
+
+def make(name: str, **options: Any) -> Env:
+    """Makes the environment called ``name``, e.g. ``"dmc/walker_walk"``.
+
+    Options of DMC tasks (see ``envs.dmc.make``): ``obs="pixels" | "vector" | "both"``, ``action_repeat=2``,
+    ``image_size=64``.
+
+    Raises:
+      ValueError: no environment has that name (the message names close matches), or an option has a bad value.
+    """
+    domain, task = split_dmc(name)
+    from ne_dreamer_jax.envs import dmc
+
+    return dmc.make(domain, task, **options)

@@ -101,8 +101,8 @@ def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
 def _stage(values: Any) -> Any:
     """The same arrays, computed once and stored.
 
-    XLA:CPU fuses producers into each of their consumers, computes them again for each, and removes optimization barriers
-    before it does so. Fusion ends at a loop that it can't see through; this one makes no iteration.
+    XLA:CPU fuses producers into each of their consumers, computes them again for each, and removes optimization
+    barriers before it does so. Fusion ends at a loop that it can't see through; this one makes no iteration.
     """
     none = jax.lax.optimization_barrier(jnp.int32(0))
     return jax.lax.fori_loop(jnp.int32(0), none, lambda _, carry: jax.tree.map(lambda a: a + 1, carry), values)

@@ -7,6 +7,7 @@ filtering.
 from __future__ import annotations
 
 import dataclasses
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -160,7 +161,7 @@ def _atlas(levels: list[np.ndarray]) -> np.ndarray:
 
 
 def look_up(texture: Checker, u: Array, v: Array, footprint: Array) -> Vec:
-    """The texture's colour at coordinates ``u``, ``v`` (in periods), filtered over ``footprint`` texels of the finest."""
+    """The texture's colour at coordinates ``u``, ``v`` (in periods), filtered over ``footprint`` finest texels."""
     side, top = texture.side, texture.side.bit_length() - 1
     detail = jnp.maximum(jnp.log2(jnp.maximum(footprint, 1e-6)), 0.0) + _DETAIL_BIAS
     finer = jnp.clip(jnp.floor(detail), 0, top - 1)

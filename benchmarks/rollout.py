@@ -1,0 +1,70 @@
+"""Times environments stepped on the device by random actions: ``python -m benchmarks.rollout --help``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from experiments.options import Name, quiet
+from ne_dreamer_jax import envs
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option(
+    "--task", "tasks", type=Name("task", envs.names()), multiple=True, default=("dmc/walker_walk",), show_default=True
+)
+@click.option("--envs", "num_envs", type=click.IntRange(1), default=16, show_default=True, help="Stepped together.")
+@click.option("--obs", type=click.Choice(["pixels", "vector", "both"]), default="vector", show_default=True)
+@click.option("--action-repeat", type=click.IntRange(1), default=2, show_default=True)
+@click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Agent steps in a timed call.")
+@click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
+def main(tasks: tuple[str, ...], num_envs: int, obs: str, action_repeat: int, steps: int, rounds: int) -> None:
+    """Agent steps a second of each task, and what its first call, compilation included, takes."""
+    quiet()
+    from benchmarks import common
+
+    cases = {task: _rollout(task, num_envs, obs, action_repeat, steps) for task in dict.fromkeys(tasks)}
+    measured = common.measure(cases, rounds=rounds)
+    columns: dict[str, dict[str, Any]] = {
+        task: {
+            "ms_per_step": timing.median / steps * 1e3,
+            "agent_steps_per_s": num_envs * steps / timing.median,
+            "gemm_units_per_step": measured.units(task) / steps,
+        }
+        for task, timing in measured.cases.items()
+    }
+    settings: dict[str, Any] = {"num_envs": num_envs, "obs": obs, "action_repeat": action_repeat, "steps": steps}
+    common.report("rollout", measured, settings=settings, columns=columns)
+
+
+def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int) -> Callable[[], Any]:
+    """A function that goes on for some steps from where its last call left off. Its first call compiles it."""
+    import jax
+
+    from ne_dreamer_jax.envs import conformance
+
+    env = envs.make(task, obs=obs, action_repeat=action_repeat)
+
+    def run(state: Any, key: jax.Array) -> tuple[Any, Any]:
+        def step(state: Any, key: jax.Array) -> tuple[Any, Any]:
+            state, timestep = jax.vmap(env.step)(state, conformance.random_action(env, key, num_envs))
+            return state, (timestep.reward, {name: value.sum() for name, value in timestep.obs.items()})
+
+        return jax.lax.scan(step, state, jax.random.split(key, steps))
+
+    compiled = jax.jit(run, donate_argnums=0)
+    held: list[Any] = []  # the state is donated
+
+    def case() -> Any:
+        if not held:
+            held.append(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))[0])
+        held[0], outputs = compiled(held[0], jax.random.key(1))
+        return outputs
+
+    return case
+
+
+if __name__ == "__main__":
+    main()

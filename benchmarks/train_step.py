@@ -1,0 +1,131 @@
+"""Times one update and its parts: ``python -m benchmarks.train_step --help``.
+
+The parts are timed by themselves, each with its gradients, on the same batch; what the compiler shares between them
+in the whole update makes their sum more than the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+import jax
+import jax.numpy as jnp
+
+from benchmarks import common
+from experiments.options import Name, quiet, refusing
+from ne_dreamer_jax import names
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option("--size", type=Name("size", names.SIZES), default="12m", show_default=True)
+@click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
+@click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
+@click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
+@click.option("--parts/--no-parts", default=True, show_default=True, help="Whether to time the parts too.")
+@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
+def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignments: tuple[str, ...]) -> None:
+    """Time the 64x64x3 update of a size, in seconds and in GEMM units."""
+    quiet()
+    from ne_dreamer_jax import replay
+    from ne_dreamer_jax.agent import make_agent, parameter_counts
+    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
+
+    with refusing(ValueError):
+        config = configure(size, method, assignments)
+        spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(actions))
+        agent = make_agent(config, spec)
+    state = agent.init(jax.random.key(0))
+    batch = jax.jit(lambda key: replay.random_batch(spec, config, key))(jax.random.key(1))
+    counts = parameter_counts(state.params)
+    jitted: Any = agent.train_step
+    temporary = jitted.lower(state, batch).compile().memory_analysis().temp_size_in_bytes
+    cases: dict[str, Callable[[], Any]] = {}
+    if parts:
+        cases |= _parts(config, spec, state, batch)
+    holder = [state]  # the update donates its state
+
+    def update() -> Any:
+        holder[0], _, metrics = agent.train_step(holder[0], batch)
+        return metrics
+
+    cases = {"update": update, **cases}
+    measured = common.measure(cases, rounds=rounds)
+    common.report(
+        "train_step",
+        measured,
+        settings={
+            "size": size,
+            "method": method,
+            "batch_size": config.batch_size,
+            "batch_length": config.batch_length,
+            "compute_dtype": config.compute_dtype,
+            "parameters": sum(counts.values()),
+            "temporary_bytes": temporary,
+            **{f"parameters_{name}": count for name, count in counts.items()},
+        },
+    )
+
+
+def configure(size: str, method: str, assignments: tuple[str, ...]) -> Any:
+    """The agent's config of a size and method with settings changed. Raises ValueError as the training command does."""
+    from experiments.train import configure as configure_run
+
+    return configure_run("dmc", size, method, {}, assignments).agent
+
+
+def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:
+    """Name -> the part with its gradients, compiled, on inputs of its own."""
+    from ne_dreamer_jax import behavior, optim, world_model
+    from ne_dreamer_jax.nets.networks import Networks
+    from ne_dreamer_jax.nets.rssm import feature, observe
+    from ne_dreamer_jax.objectives import Sizes
+
+    nets = Networks.build(spec, config.encoder, config.rssm, config.heads, jnp.dtype(config.compute_dtype))
+    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, config.batch_length, nets.dtype))
+    key = jax.random.key(2)
+    params = jax.tree.map(jnp.copy, state.params)  # the update donates the others
+    slow, target, scale = jax.tree.map(jnp.copy, (state.slow_critic, state.target, state.return_scale))
+    rollout, posterior = jax.jit(lambda p, b: world_model.posterior_rollout(nets, p, key, b))(params, batch)
+    optimizer = optim.make(config.optimizer)
+    moments = jax.jit(optimizer.init)(params)
+
+    def encoder(p: Any) -> Any:
+        return jnp.sum(jnp.square(nets.apply("encoder", p, batch.obs)))
+
+    def posterior_scan(p: Any, embedding: Any) -> Any:
+        latent, _ = observe(nets.rssm, p["rssm"], key, batch.context, embedding, rollout.prev_action, batch.is_first)
+        return jnp.sum(jnp.square(feature(latent)))
+
+    def predictions(p: Any, rollout: Any) -> Any:
+        discount = config.behavior.discount
+        losses, _ = world_model.prediction_losses(nets, config.world_model, p, rollout, posterior, discount)
+        return sum(losses.values(), jnp.zeros(()))
+
+    def representation(p: Any, rollout: Any) -> Any:
+        return sum(objective.loss(p, target, key, rollout)[0].values(), jnp.zeros(()))
+
+    def actor_critic(p: Any) -> Any:
+        losses, _, _ = behavior.actor_critic_losses(nets, config.behavior, p, slow, scale, key, rollout)
+        return sum(losses.values(), jnp.zeros(()))
+
+    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
+    compiled = {
+        "encoder": (jax.grad(encoder), (params,)),
+        "observe": (jax.grad(posterior_scan, (0, 1)), (params, rollout.embedding)),
+        "predictions": (jax.grad(predictions, (0, 1), allow_int=True), (params, rollout)),
+        "objective": (jax.grad(representation, (0, 1), allow_int=True), (params, rollout)),
+        "imagine": (lambda p, s: behavior.imagine(nets, p, key, s, config.behavior.horizon), (params, start)),
+        "actor_critic": (jax.grad(actor_critic), (params,)),
+        "optimizer": (optimizer.update, (params, moments, params)),
+    }
+    return {name: _bind(jax.jit(f), args) for name, (f, args) in compiled.items()}
+
+
+def _bind(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[[], Any]:
+    return lambda: function(*args)
+
+
+if __name__ == "__main__":
+    main()

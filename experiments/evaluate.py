@@ -1,0 +1,89 @@
+"""Evaluates the policy of a run: ``python -m experiments.evaluate --help``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from experiments.options import quiet, refusing
+from ne_dreamer_jax import run_directory
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.argument("logdir", type=click.Path(path_type=Path), metavar="DIRECTORY")
+@click.option("--episodes", type=click.IntRange(1), default=10, show_default=True, help="Episodes, played together.")
+@click.option(
+    "--checkpoint",
+    "prefer",
+    type=click.Choice(["best", "newest"]),
+    default="best",
+    show_default=True,
+    help="The checkpoint with the best evaluation return during training, or the last one.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of these episodes' beginnings."
+)
+@click.option("--video", "with_video", is_flag=True, help="Write one episode to policy.mp4 in the directory.")
+def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: int, with_video: bool) -> None:
+    """Play episodes with the trained policy of a run, beside a random policy's on the same task.
+
+    The actions are the policy's mode, the episodes none that training or its evaluations had. The result is printed
+    and written to evaluation.json in DIRECTORY. The replay buffer is not read.
+    """
+    if not run_directory.RunDirectory(logdir).marker.exists():
+        raise click.UsageError(
+            f"expected the --logdir of a run, got {logdir}: there is no {run_directory.MARKER} in it"
+        )
+    quiet()
+    import jax
+    import numpy as np
+
+    from experiments import training, video
+    from ne_dreamer_jax import checkpoint, compile_cache
+    from ne_dreamer_jax.config import Config
+
+    compile_cache.enable()
+    files = run_directory.RunDirectory(logdir)
+    with refusing(run_directory.RefusedError, ValueError):
+        config = run_directory.read_config(logdir, Config)
+        # The smallest replay there is: none is read or allocated here, and the run's may not fit this machine.
+        smallest = (config.agent.batch_length + 1) * config.loop.num_envs
+        run = training.build(replace(config, loop=replace(config.loop, capacity=smallest)))
+    with refusing(FileNotFoundError, checkpoint.DamagedError, ValueError):
+        restored = checkpoint.restore(files.checkpoints, {"agent": run.shapes.train}, prefer=prefer)
+    for reason in restored.skipped:
+        click.echo(f"Passed over a damaged checkpoint: {reason}")
+    env_step = restored.checkpoint.step
+    click.echo(f"{config.env.task}, {config.method}, after {env_step:,} environment steps ({restored.checkpoint.path})")
+
+    params = restored.items["agent"].params
+    policy_key, random_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), EVALUATION))
+    results = {}
+    for name, key in (("policy", policy_key), ("random", random_key)):
+        evaluation = run.loop.evaluate(params, key, episodes, random=name == "random", frames=True)
+        returns = np.asarray(evaluation.returns, np.float64)
+        results[name] = {
+            "mean": float(returns.mean()),
+            "std": float(returns.std()),
+            "returns": [float(value) for value in returns],
+            "lengths": [int(value) for value in evaluation.lengths],
+        }
+        click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes")
+        if name == "policy" and with_video:
+            if evaluation.frames is None:
+                click.echo("no video: this agent sees vectors, not pixels")
+            else:
+                video.write(evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND)
+                click.echo(f"{files.video} shows the first episode")
+    content = {"task": config.env.task, "env_step": env_step, "episodes": episodes, "seed": seed, **results}
+    run_directory.write_evaluation(files, content)
+
+
+EVALUATION = 0x65_76_61_6C  # sets these episodes apart from those of a run with the same seed
+
+
+if __name__ == "__main__":
+    main()

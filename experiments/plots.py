@@ -1,0 +1,78 @@
+"""Pictures of a run, drawn without a display."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from ne_dreamer_jax import metrics
+
+TRAIN, EVALUATION, RANDOM = "#0072b2", "#d55e00", "#666666"  # of the Okabe-Ito palette: apart for every eye
+
+
+def learning_curve(
+    lines: Sequence[Mapping[str, Any]],
+    path: Path,
+    *,
+    title: str,
+    env_steps: int,
+    random_return: tuple[float, float] | None = None,
+) -> None:
+    """Draws returns against environment steps into a PNG.
+
+    Args:
+      lines: of a metrics file, with ``train/return``, ``eval/return`` and ``eval/return_std`` where measured.
+      path: of the PNG, replaced whole.
+      env_steps: the run's whole budget, which is the width of the picture.
+      random_return: mean and standard deviation of a random policy's returns.
+    """
+    figure = Figure(figsize=(7.2, 4.2), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    _train(axes, *metrics.series(lines, "train/return"))
+    _evaluation(axes, lines)
+    if random_return is not None:
+        mean, deviation = random_return
+        axes.axhspan(mean - deviation, mean + deviation, color=RANDOM, alpha=0.12, lw=0)
+        axes.axhline(mean, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({mean:.3g})")
+    axes.set(title=title, xlabel="environment steps", ylabel="return of an episode", xlim=(0, env_steps))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.25, lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, loc="best")
+    else:
+        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=RANDOM)
+    beside = path.with_name(path.name + ".partial")
+    figure.savefig(beside, format="png")
+    os.replace(beside, path)
+
+
+def _train(axes: Axes, steps: np.ndarray, returns: np.ndarray) -> None:
+    if not len(steps):
+        return
+    window = max(1, len(returns) // 20)
+    if window == 1:
+        axes.plot(steps, returns, color=TRAIN, lw=1.5, marker="o", ms=3, label="training")
+        return
+    axes.plot(steps, returns, color=TRAIN, lw=0, marker=".", ms=3, alpha=0.3)
+    sums = np.cumsum(np.concatenate([[0.0], returns]))
+    first = np.maximum(np.arange(1, len(returns) + 1) - window, 0)
+    mean = (sums[1:] - sums[first]) / (np.arange(1, len(returns) + 1) - first)
+    axes.plot(steps, mean, color=TRAIN, lw=1.5, label=f"training (mean of {window} points)")
+
+
+def _evaluation(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
+    evaluated = [line for line in lines if np.isfinite(line.get("eval/return", np.nan))]
+    if not evaluated:
+        return
+    steps, means = metrics.series(evaluated, "eval/return")
+    deviations = np.array([line.get("eval/return_std", 0.0) for line in evaluated])
+    axes.plot(steps, means, color=EVALUATION, lw=2, marker="o", ms=4, label="evaluation, mean and std", clip_on=False)
+    axes.fill_between(steps, means - deviations, means + deviations, color=EVALUATION, alpha=0.18, lw=0)

@@ -1,0 +1,87 @@
+"""What a run tells people: what it is going to do, how far it is, and how long the rest takes."""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from experiments.schedule import Schedule
+from ne_dreamer_jax import memory
+from ne_dreamer_jax.agent import parameter_counts
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.loop import Loop, LoopState
+from ne_dreamer_jax.metrics import Counters
+
+
+def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
+    """The budget of a run in plain words, a line each."""
+    schedule = Schedule.of(config, loop)
+    agent, options = config.agent, config.loop
+    counts = parameter_counts(shapes.train.params)
+    modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+    agent_steps = schedule.total * schedule.num_envs
+    device = jax.devices()[0]
+    return [
+        f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, "
+        f"on {'the CPU' if device.platform == 'cpu' else device.device_kind}",
+        f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
+        f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
+        f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
+        f"{options.prefill:,} agent steps; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
+        f"  memory    replay holds {loop.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
+        f"  agent     {sum(counts.values()):,} parameters: {modules}",
+    ]
+
+
+class Pace:
+    """Rates and the time left, from the chunks and evaluations so far."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self._schedule = schedule
+        self._evaluation = 0.0
+        self._chunks: deque[float] = deque(maxlen=8)  # seconds a vector step, of chunks that learned
+
+    def evaluated(self, seconds: float) -> None:
+        """Takes note of how long an evaluation took."""
+        self._evaluation = seconds
+
+    def line(self, before: Counters, after: Counters, values: Mapping[str, Any], seconds: float) -> str:
+        """One line on a chunk."""
+        schedule = self._schedule
+        step = after.agent_step // schedule.num_envs
+        if after.update > before.update:
+            self._chunks.append(seconds / (step - before.agent_step // schedule.num_envs))
+        parts = [
+            f"{100 * step / schedule.total:5.1f} %",
+            f"env step {after.env_step:,}",
+            f"update {after.update:,}",
+            f"{(after.env_step - before.env_step) / seconds:,.0f} env steps/s",
+        ]
+        if after.update > before.update:
+            parts.append(f"{(after.update - before.update) / seconds:,.3g} updates/s")
+        if "train/return" in values:
+            parts.append(f"return {values['train/return']:.1f}")
+        if "train/loss/total" in values:
+            parts.append(f"loss {values['train/loss/total']:.4g}")
+        parts.append(self._left(step))
+        return "  ".join(parts)
+
+    def _left(self, step: int) -> str:
+        if not self._chunks:
+            return "collecting before the first update"
+        steps = (self._schedule.total - step) * statistics.median(self._chunks)
+        return f"{duration(steps + self._evaluation * self._schedule.evaluations_after(step))} left"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people say them: 42 s, 3 min 20 s, 5 h 12 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"

@@ -1,0 +1,78 @@
+"""What a run leaves on disk as it goes: metrics and checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ne_dreamer_jax import checkpoint, metrics
+from ne_dreamer_jax.loop import LoopState
+from ne_dreamer_jax.metrics import Counters
+from ne_dreamer_jax.run_directory import RunDirectory
+
+WHOLE = ("agent", "loop")  # the items of a checkpoint from which training goes on
+
+
+class Record:
+    """The metrics of a run so far, on disk and at hand."""
+
+    def __init__(self, writer: metrics.Writer, lines: list[dict[str, Any]]) -> None:
+        self._writer = writer
+        self.lines = lines
+
+    def write(self, counters: Counters, values: Mapping[str, Any]) -> None:
+        """Adds a line."""
+        self._writer.write(counters, values)
+        self.lines.append(counters._asdict() | {name: float(value) for name, value in values.items()})
+
+    def find(self, name: str, counters: Counters | None = None) -> float | None:
+        """The last value of a name, at these counters where they are given."""
+        for line in reversed(self.lines):
+            if name in line and (counters is None or line["env_step"] == counters.env_step):
+                return line[name]
+        return None
+
+    @property
+    def random_return(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of a random policy's returns."""
+        mean, deviation = self.find("eval/random_return"), self.find("eval/random_return_std")
+        return None if mean is None or deviation is None else (mean, deviation)
+
+
+class Saves:
+    """Checkpoints: whole ones in intervals of time, and the agent alone where an evaluation is the best so far."""
+
+    def __init__(self, files: RunDirectory, seconds: float, echo: Callable[[str], None]) -> None:
+        self._directory, self._seconds, self._echo = files.checkpoints, seconds, echo
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether the interval is over."""
+        return time.monotonic() - self._last >= self._seconds
+
+    def whole(self, state: LoopState, counters: Counters, score: float | None) -> None:
+        """Saves everything, unless it stands there already."""
+        if not any(found.score == score for found in self._whole_at(counters)):
+            rest: Any = ()
+            self._save({"agent": state.train, "loop": state._replace(train=rest)}, counters, score)
+        self._last = time.monotonic()
+
+    def if_best(self, state: LoopState, counters: Counters, score: float) -> None:
+        """Saves the agent if no checkpoint has a higher evaluation return."""
+        if self._whole_at(counters):  # the run was stopped here, before this evaluation
+            self.whole(state, counters, score)
+            return
+        best = checkpoint.best(checkpoint.checkpoints(self._directory))
+        if best is None or best.score is None or score >= best.score:
+            self._save({"agent": state.train}, counters, score)
+
+    def _whole_at(self, counters: Counters) -> list[checkpoint.Checkpoint]:
+        found = checkpoint.checkpoints(self._directory)
+        return [entry for entry in found if entry.step == counters.env_step and set(WHOLE) <= set(entry.items)]
+
+    def _save(self, items: dict[str, Any], counters: Counters, score: float | None) -> None:
+        began = time.monotonic()
+        checkpoint.save(self._directory, counters.env_step, items, score=score, notes=counters._asdict())
+        checkpoint.prune(self._directory, whole=WHOLE)
+        self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

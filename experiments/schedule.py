@@ -1,0 +1,50 @@
+"""When chunks end and evaluations are due."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.loop import Loop, LoopState
+from ne_dreamer_jax.metrics import Counters
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Everything here depends on the step alone, so that a run that goes on does what one that never stopped does.
+
+    A step here is a vector step: one agent step of each environment.
+    """
+
+    total: int
+    chunk: int
+    evaluation: int
+    num_envs: int
+    action_repeat: int
+
+    @classmethod
+    def of(cls, config: Config, loop: Loop) -> Schedule:
+        """The schedule of a run."""
+        num_envs, repeat = config.loop.num_envs, config.env.action_repeat
+        evaluation = max(1, round(config.loop.eval_every / (num_envs * repeat)))
+        return cls(loop.vector_steps, loop.chunk_steps, evaluation, num_envs, repeat)
+
+    def end_of_chunk(self, step: int) -> int:
+        """Where the chunk that starts at a step ends."""
+        after = (step // interval * interval + interval for interval in (self.chunk, self.evaluation))
+        return min(self.total, *after)
+
+    def evaluates(self, step: int) -> bool:
+        """Whether an evaluation is due at a step."""
+        return step == self.total or (step > 0 and step % self.evaluation == 0)
+
+    def evaluations_after(self, step: int) -> int:
+        """How many evaluations are still due after a step."""
+        regular = self.total // self.evaluation - step // self.evaluation
+        return regular + (step < self.total and self.total % self.evaluation > 0)
+
+    def counters(self, state: LoopState) -> Counters:
+        """How far a state is."""
+        step = int(state.counters.vector_step)
+        agent_step = step * self.num_envs
+        return Counters(agent_step * self.action_repeat, agent_step, int(state.train.update))

@@ -1,0 +1,152 @@
+"""Trains an agent: ``python -m experiments.train --help``.
+
+Names are checked here, before JAX loads; `experiments.training` does the work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from experiments.options import Name, quiet, refusing
+from ne_dreamer_jax import envs, names, run_directory, settings
+
+if TYPE_CHECKING:
+    from ne_dreamer_jax.config import Config
+
+FLAGS = {  # option -> the setting that it changes
+    "task": "env.task",
+    "obs": "env.obs",
+    "seed": "seed",
+    "env_steps": "loop.env_steps",
+    "num_envs": "loop.num_envs",
+    "replay_ratio": "loop.replay_ratio",
+}
+
+
+@click.command(
+    context_settings={"max_content_width": 110}, epilog=f"Tasks: {', '.join(envs.names())}. Settings: see --settings."
+)
+@click.option(
+    "--preset",
+    type=Name("preset", names.PRESETS),
+    default="dmc",
+    show_default=True,
+    help=f"The setting to start from: {', '.join(names.PRESETS)}. The options below change it.",
+)
+@click.option("--task", type=Name("task", envs.names()), help="What to learn, such as dmc/walker_walk.")
+@click.option("--method", type=Name("method", names.METHODS), help=f"One of {', '.join(names.METHODS)}.")
+@click.option("--size", type=Name("size", names.SIZES), help=f"Parameters, roughly: {', '.join(names.SIZES)}.")
+@click.option("--obs", type=Name("observation", names.OBSERVATIONS), metavar="KIND", help="pixels, vector or both.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), metavar="N", help="The same seed gives the same run, to the bit."
+)
+@click.option("--env-steps", type=click.IntRange(1), metavar="N", help="Simulator steps in all, action repeat counted.")
+@click.option("--num-envs", type=click.IntRange(1), metavar="N", help="Environments stepped together.")
+@click.option(
+    "--replay-ratio",
+    type=click.FloatRange(0, min_open=True),
+    metavar="X",
+    help="How often each agent step is learned from.",
+)
+@click.option(
+    "--set",
+    "assignments",
+    metavar="PATH=VALUE",
+    multiple=True,
+    help="Any setting, such as agent.optimizer.learning_rate=1e-4. May be repeated.",
+)
+@click.option(
+    "--logdir",
+    type=click.Path(path_type=Path),
+    metavar="DIRECTORY",
+    help="Where the run is kept. The same command on the same directory goes on with it.",
+)
+@click.option(
+    "--checkpoint-minutes",
+    type=click.FloatRange(0),
+    metavar="X",
+    default=15.0,
+    show_default="15",
+    help="Time between checkpoints; there is one at the end and on Ctrl-C besides.",
+)
+@click.option("--settings", "show", is_flag=True, help="Print all settings as PATH=VALUE and exit.")
+def main(
+    preset: str,
+    size: str | None,
+    method: str | None,
+    assignments: tuple[str, ...],
+    logdir: Path | None,
+    checkpoint_minutes: float,
+    show: bool,
+    **flags: Any,
+) -> None:
+    """Train an agent on one device: environments, rendering, replay and learning together.
+
+    \b
+    The directory of the run then holds
+      config.json    all settings             checkpoints/  to go on from, and for evaluations
+      metrics.jsonl  one JSON object a line   curve.png     returns over environment steps
+                                              policy.mp4    an episode of the trained policy
+
+    \b
+    Examples:
+      python -m experiments.train --preset quickstart --logdir runs/quickstart
+      python -m experiments.train --task dmc/walker_walk --size 12m --seed 1 --logdir runs/walker
+    """
+    if not show:
+        if logdir is None:
+            raise click.UsageError("Missing option '--logdir': where the run is kept, such as runs/first")
+        with refusing(run_directory.RefusedError):
+            run_directory.check(logdir)
+    quiet()
+    with refusing(ValueError):
+        config = configure(preset, size, method, {FLAGS[name]: value for name, value in flags.items()}, assignments)
+    if show or logdir is None:
+        for path, value in settings.paths(config).items():
+            click.echo(f"{path}={settings.as_text(value)}")
+        return
+    from experiments import progress, training
+    from ne_dreamer_jax import checkpoint, compile_cache
+
+    with refusing(ValueError, run_directory.RefusedError):
+        run_directory.check_same(logdir, config)
+        kept = compile_cache.enable()
+        run = training.build(config)
+    for line in [*progress.describe(config, run.loop, run.shapes), f"  compiled programs are kept in {kept}"]:
+        click.echo(line)
+    with refusing(run_directory.RefusedError, checkpoint.DamagedError), run_directory.claim(logdir, config) as files:
+        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=click.echo)
+    raise SystemExit(code)
+
+
+def configure(
+    preset: str, size: str | None, method: str | None, values: Mapping[str, Any], assignments: Sequence[str] = ()
+) -> Config:
+    """A preset with some settings changed.
+
+    Args:
+      values: path -> value; None leaves a setting as the preset has it.
+      assignments: ``path=value``, applied last.
+
+    Raises:
+      ValueError: no such setting, or a value that does not fit it.
+    """
+    from ne_dreamer_jax import config as presets
+
+    config = presets.preset(preset, size)
+    if method is not None:
+        config = presets.with_method(config, method)
+    for path, value in values.items():
+        if value is not None:
+            config = settings.override(config, f"{path}={value}")
+    for assignment in assignments:
+        config = settings.override(config, assignment)
+    return config
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""A training run from its start, or from where it was stopped, to its end.
+
+The host's part of the loop: it compiles the chunk, calls it, writes metrics and checkpoints, evaluates, and draws the
+pictures. What a run computes depends on its configuration alone: not on how often it was stopped, nor on when
+checkpoints were written.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import ne_dreamer_jax as nedreamer
+from experiments import plots, progress, video
+from experiments.record import WHOLE, Record, Saves
+from experiments.schedule import Schedule
+from experiments.stop import Stop
+from ne_dreamer_jax import checkpoint, compile_cache, metrics
+from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.agent import Agent, parameter_counts
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs.base import Env
+from ne_dreamer_jax.loop import Evaluation, Loop, LoopState
+from ne_dreamer_jax.metrics import Counters
+from ne_dreamer_jax.run_directory import RunDirectory
+
+Echo = Callable[[str], None]
+FRAMES_PER_SECOND = 30.0  # of videos; environments differ in how much time a step stands for
+
+
+class Run(NamedTuple):
+    """A configuration made real."""
+
+    config: Config
+    agent: Agent
+    loop: Loop
+    shapes: LoopState  # shapes and dtypes of the whole state
+
+
+def build(config: Config, env: Env | None = None) -> Run:
+    """Makes the environment, the agent and the loop of a configuration; allocates nothing.
+
+    Args:
+      env: what to train in, instead of the environment that the configuration names.
+
+    Raises:
+      ValueError: what does not fit together, or not into memory.
+    """
+    options = config.env
+    env = env or nedreamer.envs.make(
+        options.task, obs=options.obs, action_repeat=options.action_repeat, image_size=options.image_size
+    )
+    agent = nedreamer.make_agent(config.agent, env.spec)
+    loop = loops.make(config.loop, env, agent, options.action_repeat)
+    return Run(config, agent, loop, jax.eval_shape(loop.init, jax.random.key(0)))
+
+
+def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
+    """Trains to the end of the budget, from the newest checkpoint if there is one.
+
+    Args:
+      files: of a directory that is claimed for this configuration.
+      checkpoint_minutes: time between checkpoints.
+      echo: takes the lines for people.
+
+    Returns:
+      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one.
+
+    Raises:
+      ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
+    """
+    schedule = Schedule.of(run.config, run.loop)
+    start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
+    state, lines = _start(run, files, start_key, echo)
+    counters = schedule.counters(state)
+    pace = progress.Pace(schedule)
+    saves = Saves(files, 60 * checkpoint_minutes, echo)
+    chunk, frames = None, None
+    with metrics.Writer(files.metrics) as writer, Stop(echo) as stop:
+        record = Record(writer, lines)
+        while True:
+            step = counters.agent_step // schedule.num_envs
+            if schedule.evaluates(step) and record.find("eval/return", counters) is None:
+                values, frames = evaluate(run, state, evaluation_key, record.random_return is None, echo)
+                pace.evaluated(values["time/evaluation_seconds"])
+                record.write(counters, values)
+                draw(run, files, record)
+                if step < schedule.total:  # at the end everything is saved below
+                    saves.if_best(state, counters, values["eval/return"])
+            if step == schedule.total or stop.signal is not None:
+                break
+            if chunk is None:
+                chunk = _compile(run, state, echo)
+            steps = jnp.asarray(schedule.end_of_chunk(step) - step, jnp.int32)
+            began = time.perf_counter()
+            state, measured = chunk(state, steps)
+            measured = jax.device_get(measured)
+            seconds = time.perf_counter() - began
+            before, counters = counters, schedule.counters(state)
+            values = _named(measured, before, counters, seconds)
+            record.write(counters, values)
+            echo(pace.line(before, counters, values, seconds))
+            if saves.due():
+                saves.whole(state, counters, record.find("eval/return", counters))
+        saves.whole(state, counters, record.find("eval/return", counters))
+        if step < schedule.total:
+            echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
+            return 128 + (stop.signal or 0)
+    checkpoint.prune(files.checkpoints, whole=WHOLE, keep=1)  # nothing will go on from here
+    if "image" in run.agent.spec.observation and not files.video.exists():
+        if frames is None:  # the run was stopped between its last evaluation and here
+            frames = evaluate(run, state, evaluation_key, False, echo)[1]
+        video.write(frames, files.video, fps=FRAMES_PER_SECOND)
+    draw(run, files, record)
+    for line in _conclusion(run, files, record):
+        echo(line)
+    return 0
+
+
+def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo) -> tuple[dict[str, float], Any]:
+    """Metrics of an evaluation on environments of its own, and the frames of one of its episodes.
+
+    Args:
+      key: of the run's evaluations; every step has its own episodes.
+      with_random: whether to evaluate a random policy too.
+    """
+    policy_key, random_key = jax.random.split(jax.random.fold_in(key, state.counters.vector_step))
+    values: dict[str, float] = {}
+    if with_random:
+        echo("Compiling the evaluation, and playing episodes with a random policy.")
+        values |= _returns(run.loop.evaluate(state.train.params, random_key, random=True, frames=True), "eval/random_")
+    began = time.perf_counter()
+    evaluation = run.loop.evaluate(state.train.params, policy_key, frames=True)
+    values |= _returns(evaluation, "eval/")
+    values["time/evaluation_seconds"] = seconds = time.perf_counter() - began
+    echo(
+        f"Evaluation: return {values['eval/return']:.1f} ± {values['eval/return_std']:.1f} over "
+        f"{len(evaluation.returns)} episodes, in {progress.duration(seconds)}."
+    )
+    return values, evaluation.frames
+
+
+def draw(run: Run, files: RunDirectory, record: Record) -> None:
+    """Draws the learning curve so far."""
+    config = run.config
+    parameters = sum(parameter_counts(run.shapes.train.params).values())
+    title = f"{config.env.task}, {config.method}, {parameters / 1e6:.1f}M parameters, seed {config.seed}"
+    plots.learning_curve(
+        record.lines, files.curve, title=title, env_steps=config.loop.env_steps, random_return=record.random_return
+    )
+
+
+def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
+    """The state to go on from, and the metrics up to it."""
+    like = {"agent": run.shapes.train, "loop": run.shapes._replace(train=())}  # type: ignore[arg-type]
+    began = time.perf_counter()
+    try:
+        restored = checkpoint.restore(files.checkpoints, like)
+    except FileNotFoundError:
+        state = jax.block_until_ready(run.loop.init(key))
+        echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
+        return state, metrics.resume(files.metrics, -1)
+    for reason in restored.skipped:
+        echo(f"Passed over a damaged checkpoint: {reason}")
+    env_step = restored.checkpoint.step
+    echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
+    state = restored.items["loop"]._replace(train=restored.items["agent"])
+    return state, metrics.resume(files.metrics, env_step)
+
+
+def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
+    echo("Compiling the training chunk: act, step and draw the environments, store, sample, update.")
+    jitted: Any = run.loop.chunk
+    began = time.perf_counter()
+    lowered = jitted.lower(state, jnp.zeros((), jnp.int32))
+    traced = time.perf_counter()
+    with compile_cache.hits() as hits:
+        compiled = lowered.compile()
+    done = time.perf_counter()
+    how = "loaded from the cache" if hits else "compiled"
+    echo(f"Traced in {traced - began:.1f} s, {how} in {done - traced:.1f} s.")
+    return compiled
+
+
+def _named(values: Mapping[str, Any], before: Counters, after: Counters, seconds: float) -> dict[str, Any]:
+    """A chunk's metrics under their names; means over no episode or over no update are left out."""
+    of_episodes = {"return", "length"}
+    absent = set() if values["episodes"] > 0 else of_episodes
+    if after.update == before.update:
+        absent |= set(values) - of_episodes - {"episodes"}
+    rates = {
+        "time/chunk_seconds": seconds,
+        "time/env_steps_per_second": (after.env_step - before.env_step) / seconds,
+        "time/updates_per_second": (after.update - before.update) / seconds,
+    }
+    return {f"train/{name}": value for name, value in values.items() if name not in absent} | rates
+
+
+def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
+    returns = np.asarray(evaluation.returns, np.float64)
+    return {f"{prefix}return": float(returns.mean()), f"{prefix}return_std": float(returns.std())}
+
+
+def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
+    mean, deviation = record.find("eval/return"), record.find("eval/return_std")
+    lines = [f"Finished {run.config.loop.env_steps:,} environment steps of {run.config.env.task}."]
+    if mean is not None and deviation is not None and record.random_return is not None:
+        lines.append(
+            f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "
+            f"{record.random_return[0]:.1f} ± {record.random_return[1]:.1f}."
+        )
+    lines.append(f"  {files.curve}: the learning curve")
+    if files.video.exists():
+        lines.append(f"  {files.video}: an episode of the policy")
+    lines.append(f"  python -m experiments.evaluate {files.path}: more episodes")
+    return lines

@@ -1,0 +1,336 @@
+"""Checkpoints: any pytree of arrays to disk and back, bit for bit, and noticed when it is not.
+
+A checkpoint holds one or more named items (training saves "agent", the train state, apart from "loop", everything
+else, so that an evaluation never reads the replay)::
+
+    checkpoints/000000123456/        one checkpoint; the number is the step it was saved at
+      manifest.json                  step, score, the caller's notes; of each item: the name, shape, dtype and SHA-256
+                                     of every array; and a SHA-256 of all that
+      agent/  loop/                  the items, written by Orbax
+
+Orbax loads an array with flipped bits, and casts one of another dtype, without a word. So every array is checked
+against the manifest after it was read, and what is to be read is compared with what is expected before. A checkpoint
+is written beside its place and moved there when it is whole and on disk: what a crash cuts short is never seen. One
+that was damaged later is passed over for the one before it.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import json
+import math
+import os
+import shutil
+import warnings
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+_PARTIAL = ".partial-"
+
+
+class DamagedError(Exception):
+    """What was read of a checkpoint is not what was saved."""
+
+
+class Checkpoint(NamedTuple):
+    """One checkpoint on disk, as its manifest describes it."""
+
+    path: Path
+    step: int
+    score: float | None  # the evaluation return at this step, where there was an evaluation
+    notes: dict[str, Any]  # what the caller wished to keep beside it
+    items: dict[str, dict[str, dict[str, Any]]]  # item -> name of an array -> shape, dtype, sha256
+
+
+class Restored(NamedTuple):
+    """What `restore` returns."""
+
+    checkpoint: Checkpoint
+    items: dict[str, Any]
+    skipped: list[str]  # why checkpoints that came first were passed over, a sentence each
+
+
+def save(
+    directory: Path,
+    step: int,
+    items: Mapping[str, Any],
+    *,
+    score: float | None = None,
+    notes: Mapping[str, Any] | None = None,
+) -> Checkpoint:
+    """Saves pytrees of arrays; returns when they are on disk.
+
+    Args:
+      directory: where the checkpoints of a run lie; made if need be. A checkpoint of the same step is replaced.
+      step: the step that the items belong to.
+      items: name -> pytree whose leaves are arrays; typed PRNG keys are arrays too.
+      score: the evaluation return at this step, by which `prune` and `restore` find the best.
+      notes: what `json.dumps` takes.
+
+    Raises:
+      TypeError: a leaf that is no array.
+    """
+    import orbax.checkpoint as ocp
+
+    directory.mkdir(parents=True, exist_ok=True)
+    _remove_partial(directory)
+    partial = directory / f"{_PARTIAL}{step:012d}"
+    partial.mkdir()
+    described = {}
+    for item, tree in items.items():
+        arrays = _flatten(tree)
+        described[item] = {name: _describe(array) | _evidence(array) for name, array in arrays.items()}
+        stored = _stored(arrays)
+        if stored:
+            with ocp.StandardCheckpointer() as checkpointer:
+                checkpointer.save((partial / item).absolute(), stored)
+                checkpointer.wait_until_finished()  # where an error of writing comes out
+    content = {
+        "format": FORMAT,
+        "step": step,
+        "score": None if score is None or not math.isfinite(score) else float(score),
+        "notes": dict(notes or {}),
+        "items": described,
+    }
+    _write_manifest(partial, content)
+    for path in [*partial.rglob("*"), partial]:
+        _sync(path)
+    final = directory / f"{step:012d}"
+    if final.exists():
+        # Aside first, so that at no time a checkpoint stands half removed under its own name.
+        final.rename(directory / f"{_PARTIAL}old-{step:012d}")
+    partial.rename(final)
+    _sync(directory)
+    _remove_partial(directory)
+    return _read_manifest(final)
+
+
+def restore(
+    directory: Path,
+    like: Mapping[str, Any],
+    *,
+    prefer: Literal["newest", "best"] = "newest",
+) -> Restored:
+    """Loads items of the newest intact checkpoint that holds them all, or of the one with the best score.
+
+    Args:
+      like: item -> pytree of arrays or `jax.ShapeDtypeStruct` (from `jax.eval_shape`): the structure, shapes and
+        dtypes to expect. Arrays go where a leaf's sharding says, else to the first device. Only these items are read.
+      prefer: what to try first; after the best come the others, newest first.
+
+    Raises:
+      FileNotFoundError: no checkpoint holds these items.
+      DamagedError: there are some, and none is intact.
+      ValueError: an intact one, but of another structure, shape or dtype, with what was expected and what was got.
+    """
+    found, skipped = _find(directory)
+    candidates = [checkpoint for checkpoint in found if set(like) <= set(checkpoint.items)]
+    if not candidates and not skipped:
+        raise FileNotFoundError(f"{directory} has no checkpoint with {' and '.join(like)}")
+    chosen = best(candidates)
+    if prefer == "best" and chosen is not None:
+        candidates = [chosen, *(checkpoint for checkpoint in candidates if checkpoint is not chosen)]
+    for checkpoint in candidates:
+        for item, tree in like.items():
+            _check_fit(checkpoint, item, tree)
+        try:
+            items = {item: _load(checkpoint, item, tree) for item, tree in like.items()}
+        except DamagedError as error:
+            skipped.append(str(error))
+            continue
+        return Restored(checkpoint, items, skipped)
+    raise DamagedError(f"no checkpoint in {directory} is intact; remove it to begin anew. {' '.join(skipped)}")
+
+
+def checkpoints(directory: Path) -> list[Checkpoint]:
+    """The checkpoints whose manifests are intact, newest first."""
+    return _find(directory)[0]
+
+
+def best(found: Collection[Checkpoint]) -> Checkpoint | None:
+    """The checkpoint with the highest score, the newest of equals; None where none has a score."""
+    scored = [(checkpoint.score, checkpoint.step, checkpoint) for checkpoint in found if checkpoint.score is not None]
+    return max(scored, key=lambda entry: entry[:2])[2] if scored else None
+
+
+def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Collection[str] = ("agent",)) -> None:
+    """Removes all checkpoints but the newest, and of the best, if it is none of them, all items but those named.
+
+    Args:
+      whole: the items of a checkpoint from which a run can go on; only such count among the newest.
+      keep: how many of the newest stay. Two, so that damage to one costs no more than the steps in between.
+      of_best: what stays of the best, for evaluations.
+    """
+    found = checkpoints(directory)
+    chosen = best(found)
+    newest = [checkpoint for checkpoint in found if set(whole) <= set(checkpoint.items)][:keep]
+    for checkpoint in found:
+        if checkpoint in newest:
+            continue
+        if checkpoint is not chosen:
+            _discard(checkpoint.path)
+            continue
+        dropped = [item for item in checkpoint.items if item not in of_best]
+        if dropped:
+            items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}
+            kept = checkpoint._replace(items=items)._asdict()
+            del kept["path"]
+            _write_manifest(checkpoint.path, {"format": FORMAT, **kept})
+        for item in dropped:
+            shutil.rmtree(checkpoint.path / item, ignore_errors=True)
+
+
+def _find(directory: Path) -> tuple[list[Checkpoint], list[str]]:
+    found, damaged = [], []
+    names = sorted((path for path in directory.glob("*") if path.name.isdigit()), reverse=True)
+    for path in names:
+        try:
+            found.append(_read_manifest(path))
+        except DamagedError as error:
+            damaged.append(str(error))
+    return found, damaged
+
+
+def _discard(path: Path) -> None:
+    """Removes a checkpoint; renamed first, so that a crash leaves no half of one under its name."""
+    aside = path.with_name(f"{_PARTIAL}old-{path.name}")
+    path.rename(aside)
+    shutil.rmtree(aside)
+
+
+def _remove_partial(directory: Path) -> None:
+    for path in directory.glob(f"{_PARTIAL}*"):
+        shutil.rmtree(path)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _write_manifest(folder: Path, content: dict[str, Any]) -> None:
+    beside = folder / f"{MANIFEST}.partial"
+    beside.write_text(json.dumps({**content, "sha256": _digest_json(content)}, indent=1))
+    _sync(beside)
+    os.replace(beside, folder / MANIFEST)
+
+
+def _read_manifest(folder: Path) -> Checkpoint:
+    try:
+        content = json.loads((folder / MANIFEST).read_bytes())
+        digest = content.pop("sha256")
+        if digest != _digest_json(content):
+            raise ValueError("its checksum does not hold")
+        if content.pop("format") != FORMAT:
+            raise ValueError(f"expected format {FORMAT}; another version of this program wrote it")
+        return Checkpoint(folder, **content)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedError(f"{folder}: {MANIFEST} can't be read: {error!r}.") from error
+
+
+def _digest_json(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _flatten(tree: Any) -> dict[str, Any]:
+    """Name -> leaf, such as ``train.params.encoder.conv0.kernel``; names are unique."""
+    leaves: dict[str, Any] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
+        if not (hasattr(leaf, "shape") and hasattr(leaf, "dtype")):
+            raise TypeError(f"{name}: expected an array, got {leaf!r} of type {type(leaf).__name__}")
+        if name in leaves:
+            raise ValueError(f"two leaves are called {name!r}; a key of a mapping holds a dot")
+        leaves[name] = leaf
+    return leaves
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _data(leaf: Any) -> Any:
+    """A typed key's plain uint32 words, and any other array as it is."""
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _stored(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """What goes to Orbax, which refuses arrays without elements; those are made anew."""
+    return {name: _data(array) for name, array in arrays.items() if math.prod(array.shape)}
+
+
+def _describe(array: Any) -> dict[str, Any]:
+    return {"shape": list(array.shape), "dtype": str(array.dtype)}  # a key's dtype names its kind: key<fry>
+
+
+def _evidence(array: Any) -> dict[str, Any]:
+    return {"sha256": _digest(array)} | ({"impl": str(jax.random.key_impl(array))} if _is_key(array) else {})
+
+
+def _digest(array: Any) -> str:
+    data: Any = np.ascontiguousarray(_data(array))
+    return hashlib.sha256(data.reshape(-1).view(np.uint8)).hexdigest()
+
+
+def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
+    expected = {name: _describe(leaf) for name, leaf in _flatten(like).items()}
+    got = {name: {key: leaf[key] for key in ("shape", "dtype")} for name, leaf in checkpoint.items[item].items()}
+    different = [name for name in dict.fromkeys([*expected, *got]) if expected.get(name) != got.get(name)]
+    if different:
+        lines = [f"{name}: expected {_words(expected.get(name))}, got {_words(got.get(name))}" for name in different]
+        more = [f"and {len(lines) - 5} more"] if len(lines) > 5 else []
+        raise ValueError(
+            f"{checkpoint.path} holds another {item} than this configuration makes; "
+            f"load it with the configuration it was saved under.\n  " + "\n  ".join([*lines[:5], *more])
+        )
+
+
+def _words(described: dict[str, Any] | None) -> str:
+    return f"{described['dtype']}{described['shape']}" if described else "nothing"
+
+
+def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
+    expected = _flatten(like)
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+    def target(leaf: Any) -> jax.ShapeDtypeStruct:
+        data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+        sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
+        return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
+
+    stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape)}
+    read = _read(checkpoint.path / item, stored) if stored else {}
+    leaves = []
+    for name, leaf in expected.items():
+        saved = checkpoint.items[item][name]
+        array = read[name] if name in read else jax.numpy.zeros(target(leaf).shape, target(leaf).dtype)
+        if _digest(array) != saved["sha256"]:
+            raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")
+        leaves.append(jax.random.wrap_key_data(array, impl=saved["impl"]) if _is_key(leaf) else array)
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
+    import orbax.checkpoint as ocp
+
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            return checkpointer.restore(path.absolute(), like)
+    except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        reason = f"{path} can't be read: {type(error).__name__}: {first_line[:200]}."
+    # What Orbax had begun is dropped here and now, since Python warns of it whenever that happens.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+        gc.collect()
+    raise DamagedError(reason)

@@ -1,0 +1,139 @@
+"""A whole experiment as one frozen dataclass, and the named presets.
+
+Each part's dataclass lives beside the code that reads it; this module composes them. Vary a preset with
+``dataclasses.replace``, or by dotted path with `settings.override`; `settings` also takes configs to JSON and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from ne_dreamer_jax import objectives
+from ne_dreamer_jax.agent import AgentConfig
+from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.loop import LoopConfig
+from ne_dreamer_jax.nets.encoder import EncoderConfig
+from ne_dreamer_jax.nets.heads import HeadsConfig
+from ne_dreamer_jax.nets.predictor import PredictorConfig
+from ne_dreamer_jax.nets.rssm import RSSMConfig
+from ne_dreamer_jax.optim import OptimizerConfig
+from ne_dreamer_jax.settings import did_you_mean
+
+SIZES: dict[str, dict[str, int]] = {
+    # DreamerV3's sizes: deter D, hidden, classes K, encoder depth, units.
+    "1m": {"deter": 512, "hidden": 64, "classes": 4, "depth": 4, "units": 64},
+    "12m": {"deter": 2048, "hidden": 256, "classes": 16, "depth": 16, "units": 256},
+    "25m": {"deter": 3072, "hidden": 384, "classes": 24, "depth": 24, "units": 384},
+    "50m": {"deter": 4096, "hidden": 512, "classes": 32, "depth": 32, "units": 512},
+    "100m": {"deter": 6144, "hidden": 768, "classes": 48, "depth": 48, "units": 768},
+    "200m": {"deter": 8192, "hidden": 1024, "classes": 64, "depth": 64, "units": 1024},
+    "400m": {"deter": 12288, "hidden": 1536, "classes": 96, "depth": 96, "units": 1536},
+}
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Which environment, and how it is observed."""
+
+    task: str = "dmc/walker_walk"
+    obs: Literal["pixels", "vector", "both"] = "pixels"
+    """pixels, vector or both."""
+    action_repeat: int = 2
+    """Environment steps for which each action is held; rewards are summed."""
+    image_size: int = 64
+    """Height and width of the frames."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """An experiment."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    method: str = "ne_dreamer"
+    seed: int = 0
+
+
+def _check(kind: str, name: str, known: Iterable[str]) -> None:
+    if name not in (names := list(known)):
+        raise ValueError(f"no {kind} is called {name!r}. {did_you_mean(name, names)}")
+
+
+def agent_config(size: str) -> AgentConfig:
+    """The agent of the paper at one of the sizes. Raises ValueError for an unknown one."""
+    _check("size", size, SIZES)
+    s = SIZES[size]
+    return AgentConfig(
+        encoder=EncoderConfig(depth=s["depth"], units=s["units"]),
+        rssm=RSSMConfig(deter=s["deter"], hidden=s["hidden"], classes=s["classes"]),
+        heads=HeadsConfig(units=s["units"]),
+    )
+
+
+def dmc(size: str) -> Config:
+    """The paper's DeepMind Control setting: 1M environment steps, 512 replayed steps a policy step."""
+    return Config(agent=agent_config(size))
+
+
+def quickstart(size: str) -> Config:
+    """Learns in minutes on two CPU cores.
+
+    Against the paper's setting: smaller frames and batches, a smaller predictor, a shorter horizon, ten times the
+    learning rate and a nearer discount, which suits the few updates that there are.
+    """
+    base = agent_config(size)
+    agent = replace(
+        base,
+        heads=replace(base.heads, bins=63),
+        objective=replace(base.objective, predictor=PredictorConfig(layers=1, width=128, feedforward=256)),
+        behavior=BehaviorConfig(horizon=10, discount=0.98),
+        optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
+        batch_size=16,
+        batch_length=16,
+    )
+    loop = LoopConfig(
+        env_steps=30_000, num_envs=8, replay_ratio=48.0, prefill=1_000, eval_every=10_000, eval_episodes=10
+    )
+    return Config(EnvConfig("dmc/cartpole_swingup", image_size=32), agent, loop)
+
+
+def smoke(size: str) -> Config:
+    """A minute or two on a CPU: touches everything, learns nothing."""
+    agent = replace(agent_config(size), batch_size=4, batch_length=16)
+    loop = LoopConfig(
+        env_steps=4_400, num_envs=4, replay_ratio=2.0, prefill=400, chunk_steps=50, eval_every=2_200, eval_episodes=1
+    )
+    return Config(EnvConfig("dmc/cartpole_balance"), agent, loop)
+
+
+PRESETS = {"dmc": (dmc, "12m"), "quickstart": (quickstart, "1m"), "smoke": (smoke, "1m")}
+
+
+def preset(name: str, size: str | None = None) -> Config:
+    """A named setting, at one of `SIZES` (default: the preset's own). Raises ValueError naming close matches."""
+    _check("preset", name, PRESETS)
+    build, default = PRESETS[name]
+    return build(size or default)
+
+
+def with_method(config: Config, method: str) -> Config:
+    """The config with another of the paper's methods; what the methods share stays as the config has it."""
+    _check("method", method, METHODS)
+    agent = replace(config.agent, objective=METHODS[method](config.agent.objective))
+    return replace(config, agent=agent, method=method)
+
+
+def _with_predictor(objective: objectives.NextEmbedding, **changes: Any) -> objectives.NextEmbedding:
+    return replace(objective, predictor=replace(objective.predictor, **changes))
+
+
+METHODS: dict[str, Callable[[Any], Any]] = {
+    "ne_dreamer": lambda objective: objective,
+    "ne_dreamer/no_transformer": lambda objective: _with_predictor(objective, layers=0),
+    "ne_dreamer/no_shift": lambda objective: replace(objective, shift=0),
+    "ne_dreamer/no_projector": lambda objective: _with_predictor(objective, projector=False),
+}
+"""Method -> its objective, made from the full method's."""

@@ -1,0 +1,215 @@
+"""Loading a Control Suite model, and stepping it on MJX in the order in which dm_control steps it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import io
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+# MuJoCo looks for an OpenGL library when imported, unless told not to. Drawing here needs none.
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from ne_dreamer_jax.types import Array
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that its optional Warp backend is not installed
+    from mujoco import mjx
+
+Integrated = dict[str, Array]
+"""The fields of ``mjx.Data`` that an integrator changes. With the controls, all others follow from them."""
+
+
+def integrated(data: mjx.Data) -> Integrated:
+    """Picks the integrated fields out of ``data``."""
+    return {name: getattr(data, name) for name in ("time", "qpos", "qvel", "act", "qacc_warmstart")}
+
+
+def substitute(data: mjx.Data, where: Array, new: Integrated) -> mjx.Data:
+    """``data``, not settled, with its integrated fields replaced if ``where``."""
+    return data.replace(**jax.tree.map(lambda a, b: jnp.where(where, a, b), new, integrated(data)))
+
+
+def suite_directory() -> Path:
+    """Where dm_control keeps the Control Suite's models; found without importing dm_control.
+
+    Raises:
+      ImportError: dm_control is not installed.
+    """
+    found = importlib.util.find_spec("dm_control")
+    if found is None or found.origin is None:
+        raise ImportError("the dmc environments need dm_control's model files: pip install dm-control")
+    return Path(found.origin).parent / "suite"
+
+
+@contextlib.contextmanager
+def _mjx_numerics() -> Iterator[None]:
+    """What MJX is traced under, whatever the caller's configuration.
+
+    It relies on implicit promotion, and its solver on float32 products: the three digits of TensorFloat-32, a GPU's
+    default, would take its trajectories away from MuJoCo's.
+    """
+    promotion = (jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"))
+    with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
+        yield
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """A MuJoCo model and its stepping.
+
+    dm_control keeps everything that depends on positions and velocities current ("settled" here) between control
+    steps: a control step is ``n_sub_steps`` times forces and integration at the current state, then positions and
+    velocities of the new state. So sensors of accelerations and forces speak of the state before the last
+    integration, all others of the state after it.
+    """
+
+    mj_model: mujoco.MjModel
+    model: mjx.Model  # the same on the device
+    n_sub_steps: int  # physics steps in a control step
+
+    @classmethod
+    def load(
+        cls,
+        filename: str,
+        control_timestep: float | None = None,
+        edit: Callable[[mujoco.MjSpec], None] | None = None,
+    ) -> Simulation:
+        """Loads a model of the Control Suite.
+
+        Args:
+          filename: name of the MJCF file in the suite's directory.
+          control_timestep: seconds; None: one physics step.
+          edit: changes the specification in place before it is compiled.
+        """
+        spec = mujoco.MjSpec.from_file(str(suite_directory() / filename))
+        if edit is not None:
+            edit(spec)
+        with warnings.catch_warnings():
+            # cheetah.xml scales its masses in a way that MuJoCo discourages in new models.
+            warnings.filterwarnings("ignore", message=".*settotalmass")
+            mj_model = spec.compile()
+        mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # no part in the dynamics; MJX refuses it
+        if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and (mj_model.nq != mj_model.nv or mj_model.na):
+            raise ValueError(f"{filename}: RK4 is implemented for hinges, slides and stateless actuators only")
+        n_sub_steps = 1 if control_timestep is None else round(control_timestep / mj_model.opt.timestep)
+        return cls(mj_model, mjx.put_model(mj_model), n_sub_steps)
+
+    @property
+    def control_timestep(self) -> float:
+        """Seconds."""
+        return self.n_sub_steps * self.mj_model.opt.timestep
+
+    def initial(self) -> mjx.Data:
+        """The model's default state, at rest and settled."""
+        data = mujoco.MjData(self.mj_model)
+        mujoco.mj_step1(self.mj_model, data)
+        return mjx.put_data(self.mj_model, data)
+
+    def in_contact(self, data: mjx.Data) -> Array:
+        """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
+        with _mjx_numerics():
+            contact = mjx.collision(self.model, mjx.kinematics(self.model, data))._impl.contact
+            return (contact.dist < contact.includemargin).any()
+
+    def settle(self, data: mjx.Data) -> mjx.Data:
+        """Brings all that depends on positions and velocities, but for sensors, up to date."""
+        with _mjx_numerics():
+            return mjx.fwd_velocity(self.model, mjx.fwd_position(self.model, data))
+
+    def begin(self, data: mjx.Data) -> mjx.Data:
+        """Settles, and reads all sensors without any actuation, as dm_control does at the start of an episode."""
+        data = self.settle(data)
+        if (self.mj_model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any():
+            data = self._accelerate(data, passive=jnp.ones((), bool))
+        return self._sense(data)
+
+    def advance(self, data: mjx.Data, control: Array, restart: Array, start: Integrated) -> mjx.Data:
+        """One control step or, where ``restart``, what ``begin`` makes of ``start``.
+
+        Holding ``start`` in place of what the integrator returns makes one piece of compiled code serve both.
+
+        Args:
+          data: settled, as is what is returned.
+          control: float32 [nu], in the actuators' units.
+          restart: bool [].
+          start: of the new episode.
+        """
+
+        def move(data: mjx.Data) -> mjx.Data:
+            settled = self.settle(substitute(data, restart, start))
+            # In 64-bit mode MJX returns some integers wider than it takes them; a loop's carry has to keep its types.
+            return jax.tree.map(lambda new, old: new.astype(old.dtype), settled, data)
+
+        def euler(_: Array, data: mjx.Data) -> mjx.Data:
+            data = self._accelerate(data, passive=restart)
+            with _mjx_numerics():
+                return move(mjx.euler(self.model, data))
+
+        def runge_kutta(_: Array, data: mjx.Data) -> mjx.Data:
+            return _runge_kutta(data, self.mj_model.opt.timestep, lambda data: self._accelerate(data, restart), move)
+
+        rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        data = data.replace(ctrl=jnp.where(restart, 0.0, control))
+        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, runge_kutta if rk4 else euler, data))
+
+    def _accelerate(self, data: mjx.Data, passive: Array) -> mjx.Data:
+        """Forces, constraints and the sensors that need them; where ``passive`` without the actuators' forces."""
+        with _mjx_numerics():
+            data = mjx.fwd_actuation(self.model, data)
+            data = data.replace(qfrc_actuator=jnp.where(passive, 0.0, data.qfrc_actuator))
+            data = mjx.fwd_acceleration(self.model, data)
+            if data._impl.efc_J.size == 0:  # no constraint is possible in this model
+                return data.replace(qacc=data.qacc_smooth)
+            return mjx.sensor_acc(self.model, mjx.solve(self.model, data))
+
+    def _sense(self, data: mjx.Data) -> mjx.Data:
+        """Reads the sensors that need positions and velocities alone."""
+        with _mjx_numerics():
+            return mjx.sensor_vel(self.model, mjx.sensor_pos(self.model, data))
+
+    def sensor(self, name: str) -> slice:
+        """Where a sensor's readings lie in ``data.sensordata``."""
+        sensor = self.mj_model.sensor(name)
+        return slice(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
+
+
+def _runge_kutta(
+    data: mjx.Data,
+    timestep: float,
+    accelerate: Callable[[mjx.Data], mjx.Data],
+    move: Callable[[mjx.Data], mjx.Data],
+) -> mjx.Data:
+    """The classical fourth-order Runge-Kutta step, for models with as many coordinates as degrees of freedom.
+
+    MJX has one, but unrolled, which takes four times as long to compile. Here each stage is one turn of a loop:
+    accelerations at the current point, then a move to the next stage's point or, from the last stage, to the result.
+    """
+    qpos, qvel = data.qpos, data.qvel
+    ahead = jnp.array([0.5, 0.5, 1.0, 0.0])  # where the next stage lies along this stage's slope
+    weight = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6  # of this stage's slope in the mean slope
+    last = jnp.array([0.0, 0.0, 0.0, 1.0])  # whether to move along the mean slope instead
+
+    def stage(
+        carry: tuple[mjx.Data, Array, Array], row: tuple[Array, Array, Array]
+    ) -> tuple[tuple[mjx.Data, Array, Array], None]:
+        (data, mean_qvel, mean_qacc), (ahead, weight, last) = carry, row
+        data = accelerate(data)
+        mean_qvel, mean_qacc = mean_qvel + weight * data.qvel, mean_qacc + weight * data.qacc
+        data = data.replace(
+            qpos=qpos + timestep * (ahead * data.qvel + last * mean_qvel),
+            qvel=qvel + timestep * (ahead * data.qacc + last * mean_qacc),
+            time=data.time + timestep * last,
+            qacc_warmstart=data.qacc,
+        )
+        return (move(data), mean_qvel, mean_qacc), None
+
+    carry = (data, jnp.zeros_like(qvel), jnp.zeros_like(qvel))
+    return jax.lax.scan(stage, carry, (ahead, weight, last))[0][0]

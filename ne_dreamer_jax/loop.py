@@ -1,0 +1,267 @@
+"""Acting, the environments, replay and learning as one compiled program.
+
+``Loop.chunk`` runs a number of vector steps on the device: step the environments, act, add to replay, and as many
+updates as the replay ratio asks for. The host sees one dict of metrics a chunk. The whole state is one pytree, so
+that going on from a saved one gives the same bits as never having stopped; where chunks begin and end changes none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ne_dreamer_jax import replay as replay_lib
+from ne_dreamer_jax.types import Array, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
+
+PAPER_CAPACITY = 5_000_000
+CHUNK_UPDATES = 64  # between two of these the host can neither report, save nor stop
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Settings of the training loop. One agent step is ``env.action_repeat`` environment steps of one environment."""
+
+    env_steps: int = 1_000_000
+    """Environment steps in all, over all environments."""
+    num_envs: int = 16
+    """N, environments stepped together."""
+    replay_ratio: float = 512.0
+    """Replayed steps for each agent step; an update replays B * T."""
+    capacity: int | None = None
+    """Transitions that replay holds; none: what the run can fill, at most the paper's 5e6."""
+    prefill: int = 4_096
+    """Agent steps before the first update."""
+    chunk_steps: int = 64
+    """Vector steps (agent steps of each environment) of one call to the device, unless that is too many updates."""
+    eval_every: int = 50_000
+    """Environment steps between evaluations."""
+    eval_episodes: int = 10
+    """Episodes of an evaluation, on environments of their own."""
+    write_latents: bool = True
+    """Whether the posterior latents of an update replace those in replay."""
+    latent_dtype: Literal["float32", "bfloat16"] = "float32"
+    """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
+
+
+class Counters(NamedTuple):
+    """How far a run has come, as int32 []."""
+
+    vector_step: Array  # agent steps of each environment
+    credit: Array  # replayed steps that are due, in units of 1 / the replay ratio's denominator
+
+
+class Episodes(NamedTuple):
+    """The running episode of each environment."""
+
+    ret: Array  # float32 [N], sum of rewards so far
+    length: Array  # int32 [N], agent steps so far
+
+
+class LoopState(NamedTuple):
+    """Everything that a run is: saved and restored as a whole."""
+
+    train: TrainState
+    env: Any  # environment states, [N, ...]
+    policy: PolicyState  # [N, ...]; its prev_action is what the environments are stepped with next
+    replay: Any
+    episodes: Episodes
+    counters: Counters
+    key: Array  # typed key []
+
+
+class Evaluation(NamedTuple):
+    """Episodes of a fixed policy."""
+
+    returns: Array  # float32 [M]
+    lengths: Array  # int32 [M], agent steps
+    frames: Any  # uint8 numpy [steps, H, W, 3] of the first environment's episode, or None
+
+
+class Loop(NamedTuple):
+    """The functions of a training run."""
+
+    init: Callable[[Array], LoopState]
+    """key -> the state before the first step."""
+    chunk: Callable[[LoopState, Array], tuple[LoopState, Metrics]]
+    """(state, vector steps int32 []) -> new state and metrics. Jitted; donates the state."""
+    evaluate: Callable[..., Evaluation]
+    """(params, key, episodes, random=False, frames=False) -> returns of the policy's mode, or of random actions."""
+    replay_bytes: int
+    """What replay will allocate."""
+    capacity: int
+    """Transitions that replay will hold."""
+    chunk_steps: int
+    """Vector steps of one chunk: as configured, but no more than about `CHUNK_UPDATES` updates."""
+    vector_steps: int
+    """Vector steps of the whole run."""
+    updates: int
+    """Updates of the whole run."""
+
+
+def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
+    """The training loop of an agent in an environment.
+
+    Raises ValueError where the replay can't hold a sequence, or does not fit the memory.
+    """
+    n, b, length = config.num_envs, agent.config.batch_size, agent.config.batch_length
+    vector_steps = -(-config.env_steps // (n * action_repeat))
+    ratio = Fraction(config.replay_ratio).limit_denominator(1_000)
+    if ratio == 0:
+        raise ValueError(f"loop.replay_ratio: expected at least 0.001, got {config.replay_ratio}")
+    price = b * length * ratio.denominator  # of one update, in units of credit
+    wage = n * ratio.numerator  # of one vector step
+    prefill = max(-(-config.prefill // n), length + 1)
+    updates = max(0, vector_steps - prefill) * wage // price
+    least = (length + 1) * n
+    if config.capacity is not None and config.capacity < least:
+        raise ValueError(
+            f"loop.capacity: expected at least {least:,} transitions, a sequence of agent.batch_length {length} and "
+            f"the step before it for each of {n} environments, got {config.capacity:,}."
+        )
+    capacity = min(PAPER_CAPACITY, vector_steps * n) if config.capacity is None else config.capacity
+    capacity = max(capacity, least) // n * n
+
+    step_envs, prepare_envs = jax.vmap(env.step), jax.vmap(env.prepare)
+
+    def transition(timestep: TimeStep, policy: PolicyState, action: Array) -> Transition:
+        flags = (timestep.is_first, timestep.is_last, timestep.is_terminal)
+        return Transition(timestep.obs, action, timestep.reward, *flags, policy.latent)
+
+    def example() -> Transition:
+        """The shapes of one vector step's transition."""
+
+        def build() -> Transition:
+            obs = {name: jnp.zeros((n, *s.shape), s.dtype) for name, s in agent.spec.observation.items()}
+            no, policy = jnp.zeros((n,), bool), agent.init_policy(n)
+            return transition(TimeStep(obs, jnp.zeros((n,)), no, no, no), policy, policy.prev_action)
+
+        return jax.eval_shape(build)
+
+    shapes, latent_dtype = example(), jnp.dtype(config.latent_dtype)
+    replay_lib.check_capacity(shapes, capacity, n, latent_dtype)
+
+    def init(key: Array) -> LoopState:
+        agent_key, env_key, key = jax.random.split(key, 3)
+        return LoopState(
+            train=agent.init(agent_key),
+            env=prepare_envs(jax.random.split(env_key, n)),
+            policy=agent.init_policy(n),
+            replay=replay_lib.init(shapes, capacity, n, latent_dtype),
+            episodes=Episodes(jnp.zeros((n,)), jnp.zeros((n,), jnp.int32)),
+            counters=Counters(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)),
+            key=key,
+        )
+
+    def update(carry: tuple[TrainState, Any, Array, Metrics]) -> tuple[TrainState, Any, Array, Metrics]:
+        train, replay, key, sums = carry
+        key, sample_key = jax.random.split(key)
+        batch = replay_lib.sample(replay, sample_key, b, length)
+        train, latents, metrics = agent.train_step(train, batch)
+        if config.write_latents:
+            replay = replay_lib.write_latents(replay, batch.index, latents)
+        return train, replay, key, {name: sums[name] + metrics[name] for name in sums}
+
+    def vector_step(state: LoopState, sums: Metrics, episode_sums: Metrics) -> tuple[LoopState, Metrics, Metrics]:
+        key, act_key, update_key = jax.random.split(state.key, 3)
+        env_state, timestep = step_envs(state.env, state.policy.prev_action)
+        policy, action = agent.act(state.train.params, state.policy, timestep, act_key)
+        replay = replay_lib.add(state.replay, transition(timestep, policy, action))
+
+        ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
+        steps = jnp.where(timestep.is_first, 0, state.episodes.length + 1)
+        ended = timestep.is_last
+        episode_sums = {
+            "return": episode_sums["return"] + jnp.sum(jnp.where(ended, ret, 0.0)),
+            "length": episode_sums["length"] + jnp.sum(jnp.where(ended, steps, 0)).astype(jnp.float32),
+            "episodes": episode_sums["episodes"] + jnp.sum(ended).astype(jnp.float32),
+        }
+
+        done = state.counters.vector_step + 1
+        credit = state.counters.credit + jnp.where(done > prefill, wage, 0)
+        due = credit // price
+        train, replay, _, sums = jax.lax.fori_loop(
+            0, due, lambda _, carry: update(carry), (state.train, replay, update_key, sums)
+        )
+        counters = Counters(done, credit - due * price)
+        episodes = Episodes(ret, steps)
+        return LoopState(train, env_state, policy, replay, episodes, counters, key), sums, episode_sums
+
+    def chunk(state: LoopState, steps: Array) -> tuple[LoopState, Metrics]:
+        batch = jax.eval_shape(lambda r, k: replay_lib.sample(r, k, b, length), state.replay, state.key)
+        metric_shapes = jax.eval_shape(agent.train_step, state.train, batch)[2]
+        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metric_shapes)
+        episode_sums = {name: jnp.zeros(()) for name in ("return", "length", "episodes")}
+        before = state.train.update
+        state, sums, episode_sums = jax.lax.fori_loop(
+            0, steps, lambda _, carry: vector_step(*carry), (state, sums, episode_sums)
+        )
+        # Where nothing was counted the mean is 0 / 0: the host leaves those out.
+        count = (state.train.update - before).astype(jnp.float32)
+        metrics = {name: value / count for name, value in sums.items()}
+        finished = episode_sums.pop("episodes")
+        metrics |= {name: value / finished for name, value in episode_sums.items()} | {"episodes": finished}
+        return state, metrics
+
+    def eval_init(key: Array, episodes: int) -> tuple:
+        env_key, key = jax.random.split(key)
+        env_state = prepare_envs(jax.random.split(env_key, episodes))
+        zeros = jnp.zeros((episodes,))
+        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), zeros > 0)
+
+    def eval_steps(params: Any, carry: tuple, random: Array, frames: bool) -> tuple[tuple, Any]:
+        def step(carry: tuple, _: None) -> tuple[tuple, Any]:
+            env_state, policy, key, returns, lengths, done = carry
+            key, act_key, random_key = jax.random.split(key, 3)
+            env_state, timestep = step_envs(env_state, policy.prev_action)
+            policy, action = agent.act(params, policy, timestep, act_key, mode="mode")
+            action = jnp.where(random, random_action(agent.spec.action, random_key, action.shape[0]), action)
+            policy = policy._replace(prev_action=action)
+            counts = ~done
+            returns = returns + jnp.where(counts, timestep.reward, 0.0)
+            lengths = lengths + (counts & ~timestep.is_first).astype(jnp.int32)
+            done = done | timestep.is_last
+            seen = (timestep.obs["image"][0], counts[0]) if frames else None
+            return (env_state, policy, key, returns, lengths, done), seen
+
+        return jax.lax.scan(step, carry, None, length=config.chunk_steps)
+
+    eval_steps_jit = jax.jit(eval_steps, static_argnums=3, donate_argnums=1)
+
+    def evaluate(
+        params: Any, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False
+    ) -> Evaluation:
+        record = frames and "image" in agent.spec.observation
+        carry, clips = eval_init(key, episodes or config.eval_episodes), []
+        while not bool(jnp.all(carry[-1])):
+            carry, seen = eval_steps_jit(params, carry, jnp.asarray(random), record)
+            if record:
+                images, counts = jax.device_get(seen)
+                clips.append(images[counts])
+        video = None
+        if clips:
+            video = np.concatenate(clips)
+        return Evaluation(carry[3], carry[4], video)
+
+    return Loop(
+        init=init,
+        chunk=jax.jit(chunk, donate_argnums=0),
+        evaluate=evaluate,
+        replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
+        capacity=capacity,
+        chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // wage)),
+        vector_steps=vector_steps,
+        updates=updates,
+    )
+
+
+def random_action(spec: Any, key: Array, n: int) -> Array:
+    """Uniform actions [n, ...] for environments of this action spec."""
+    if isinstance(spec, ContinuousAction):
+        return jax.random.uniform(key, (n, spec.size), minval=-1.0, maxval=1.0)
+    return jax.random.randint(key, (n,), 0, spec.size)

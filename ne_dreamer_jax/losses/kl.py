@@ -1,0 +1,74 @@
+"""KL terms between categorical latents, with DreamerV3's stabilisers (Hafner et al., 2023)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def unimix_logits(logits: jax.Array, mix: float = 0.01) -> jax.Array:
+    """Normalised log-probabilities of ``(1 - mix) * softmax(logits) + mix / K``.
+
+    Keeps every probability at or above ``mix / K`` and so every KL finite.
+
+    Args:
+      logits: ``[..., K]``.
+      mix: share of the uniform distribution, in [0, 1]; 0 leaves the distribution as it is.
+
+    Returns:
+      float32 ``[..., K]``.
+
+    Source: DreamerV3, "unimix".
+    """
+    logits = logits.astype(jnp.float32)
+    if mix == 0.0:
+        return jax.nn.log_softmax(logits)
+    return jnp.log((1.0 - mix) * jax.nn.softmax(logits) + mix / logits.shape[-1])
+
+
+def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
+    """KL(p || q) = sum_k p_k (log p_k - log q_k) of categorical distributions.
+
+    Args:
+      p_logits: ``[..., K]``, normalised or not.
+      q_logits: ``[..., K]``, likewise.
+
+    Returns:
+      float32 ``[...]``, in nats.
+    """
+    log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
+    log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
+    return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
+
+
+def balanced_kl(
+    posterior_logits: jax.Array,
+    prior_logits: jax.Array,
+    free_nats: float = 1.0,
+    unimix: float = 0.01,
+) -> tuple[jax.Array, jax.Array]:
+    r"""The two directions of DreamerV3's KL balancing, :math:`L_{dyn}` and :math:`L_{rep}`.
+
+    .. math::
+        L_{dyn} = \max\big(f, \sum_s KL(\mathrm{sg}(q_s) \| p_s)\big), \qquad
+        L_{rep} = \max\big(f, \sum_s KL(q_s \| \mathrm{sg}(p_s))\big)
+
+    with q the posterior and p the prior over latent s, both mixed with the uniform distribution, and f the free nats.
+    The maximum is taken once, after the sum over the S latents; below f there is no gradient. DreamerV3 scales them by
+    1.0 (dynamics: trains the prior) and 0.1 (representation: trains the posterior).
+
+    Args:
+      posterior_logits: ``[..., S, K]``.
+      prior_logits: ``[..., S, K]``.
+      free_nats: f.
+      unimix: see `unimix_logits`; applied to both sides.
+
+    Returns:
+      ``(dynamics, representation)``, each float32 ``[...]``, in nats; the mean is the caller's. Their values are
+      equal, their gradients are not.
+    """
+    posterior = unimix_logits(posterior_logits, unimix)
+    prior = unimix_logits(prior_logits, unimix)
+    dynamics = jnp.sum(categorical_kl(jax.lax.stop_gradient(posterior), prior), axis=-1)
+    representation = jnp.sum(categorical_kl(posterior, jax.lax.stop_gradient(prior)), axis=-1)
+    return jnp.maximum(dynamics, free_nats), jnp.maximum(representation, free_nats)

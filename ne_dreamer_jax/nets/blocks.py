@@ -1,0 +1,96 @@
+"""Layers that every network shares: linear maps, RMSNorm and the Linear-RMSNorm-SiLU stack of DreamerV3.
+
+Parameters are float32; ``dtype`` is what the matrix products are computed in (bfloat16 on accelerators). Norms
+are computed in float32.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.linen import initializers
+
+from ne_dreamer_jax.types import Array
+
+NORM_EPSILON = 1e-4
+
+
+def kernel_init(scale: float = 1.0) -> initializers.Initializer:
+    """Truncated normal over the fan in, standard deviation ``scale * 1.1368 * sqrt(1 / fan_in)``, cut at two of them.
+
+    The factor makes the standard deviation after the cut ``scale * sqrt(1 / fan_in)`` (DreamerV3).
+    """
+    if scale == 0:
+        return initializers.zeros_init()
+    return initializers.variance_scaling(scale**2, "fan_in", "truncated_normal")
+
+
+def rms_norm(x: Array, scale: Array) -> Array:
+    """RMSNorm over the last axis in float32, returned in the dtype of ``x [..., C]``; ``scale [C]``."""
+    x32 = x.astype(jnp.float32)
+    inverse = jax.lax.rsqrt(jnp.mean(jnp.square(x32), axis=-1, keepdims=True) + NORM_EPSILON)
+    return (x32 * inverse * jnp.expand_dims(scale, range(x.ndim - 1))).astype(x.dtype)
+
+
+class Linear(nn.Module):
+    """Affine map of the concatenation of its inputs ``[..., I_k]`` to ``[..., units]``.
+
+    Several inputs are multiplied by their own rows of the kernel, which spares writing out the concatenation.
+    """
+
+    units: int
+    use_bias: bool = True
+    scale: float = 1.0
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, *inputs: Array) -> Array:
+        rows = sum(x.shape[-1] for x in inputs)
+        kernel = self.param("kernel", kernel_init(self.scale), (rows, self.units), jnp.float32).astype(self.dtype)
+        start, total = 0, None
+        for x in inputs:
+            product = x.astype(self.dtype) @ kernel[start : start + x.shape[-1]]
+            total = product if total is None else total + product
+            start += x.shape[-1]
+        assert total is not None
+        if self.use_bias:
+            bias = self.param("bias", initializers.zeros_init(), (self.units,), jnp.float32).astype(self.dtype)
+            total = total + jnp.expand_dims(bias, range(total.ndim - 1))
+        return total
+
+
+class RMSNorm(nn.Module):
+    """`rms_norm` with a learned scale."""
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return rms_norm(x, self.param("scale", initializers.ones_init(), (x.shape[-1],), jnp.float32))
+
+
+class Block(nn.Module):
+    """Linear, RMSNorm, SiLU: ``[..., I_k]`` to ``[..., units]``."""
+
+    units: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, *inputs: Array) -> Array:
+        return nn.silu(RMSNorm(name="norm")(Linear(self.units, dtype=self.dtype, name="linear")(*inputs)))
+
+
+class MLP(nn.Module):
+    """``layers`` blocks of ``units``; the first takes the concatenation of the inputs."""
+
+    layers: int
+    units: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, *inputs: Array) -> Array:
+        for i in range(self.layers):
+            inputs = (Block(self.units, self.dtype, name=f"block{i}")(*inputs),)
+        (x,) = inputs
+        return x

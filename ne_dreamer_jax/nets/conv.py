@@ -1,0 +1,84 @@
+"""Convolutions, lowered by platform.
+
+On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
+on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
+matrix products over a few images at a time. The platform is the one that JAX would place new arrays on when the
+function is traced; a wrong guess (a program traced for another device than the default) costs speed, never correctness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.nets import cpu_conv
+from ne_dreamer_jax.nets.blocks import rms_norm
+from ne_dreamer_jax.nets.cpu_conv import Stage as Stage
+from ne_dreamer_jax.types import Array
+
+
+def conv2d(x: Array, kernel: Array) -> Array:
+    """Convolution of stride 1 with SAME zero padding: x ``[N, H, W, C_in]``, kernel ``[k, k, C_in, C_out]``.
+
+    Returns ``[N, H, W, C_out]`` in the dtype of ``x``, which is also that of the kernel. Differentiable once by reverse
+    mode on a CPU, without limit elsewhere. Raises ValueError for shapes or dtypes that don't fit.
+    """
+    if x.ndim != 4 or kernel.ndim != 4 or x.shape[-1] != kernel.shape[2] or x.dtype != kernel.dtype:
+        raise ValueError(
+            f"Expected x [N, H, W, C_in] and kernel [k, k, C_in, C_out] of one dtype, got {x.dtype} {list(x.shape)} "
+            f"and {kernel.dtype} {list(kernel.shape)}."
+        )
+    if _on_cpu() and x.dtype == jnp.float32:
+        return cpu_conv.conv2d(x, kernel)
+    return lax_conv2d(x, kernel)
+
+
+def lax_conv2d(x: Array, kernel: Array) -> Array:
+    """`conv2d` as XLA has it."""
+    return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+
+
+def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
+    """The image encoder: ``[N, H, W, C]`` to ``[N, H / 2**n, W / 2**n, C_out]`` of ``dtype`` through n stages.
+
+    uint8 images become ``image / 255 - 0.5``; images of a floating dtype are taken as they are, and can be
+    differentiated for. A stage is a convolution (stride 1, SAME, bias), a 2x2 max-pool, an RMSNorm over channels in
+    float32 and SiLU; products are computed in ``dtype``. The gradient of a maximum that several outputs share goes to
+    the first of them on a CPU, and is divided among them elsewhere. Raises ValueError where the sides can't be halved
+    once a stage.
+    """
+    factor = 2 ** len(stages)
+    if images.ndim != 4 or any(side % factor for side in images.shape[1:3]):
+        raise ValueError(
+            f"Expected images [N, H, W, C] with H and W multiples of {factor}, for {len(stages)} stages that halve "
+            f"them, got {list(images.shape)}. Resize the images or use fewer stages."
+        )
+    if _on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
+        return cpu_conv.encode_images(images, stages)
+    return lax_encode_images(images, stages, dtype)
+
+
+def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
+    """`encode_images` as a composition of XLA's own operations."""
+    x = (images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images).astype(dtype)
+    for stage in stages:
+        x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
+        x = jax.nn.silu(rms_norm(x, stage.scale))
+    return x
+
+
+def _on_cpu() -> bool:
+    # A device, the name of a platform, or None.
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    if device is None:
+        return jax.default_backend() == "cpu"
+    return getattr(device, "platform", device) == "cpu"
+
+
+def _pool(x: Array) -> Array:
+    """2x2 max-pool of ``[N, H, W, C]`` as pairwise maxima, whose gradient is elementwise."""
+    x = jnp.maximum(x[:, ::2], x[:, 1::2])
+    return jnp.maximum(x[:, :, ::2], x[:, :, 1::2])

@@ -1,0 +1,112 @@
+"""Observations to embeddings: ``e_t = f_enc(x_t)``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from flax.linen import initializers
+
+from ne_dreamer_jax.losses import symlog
+from ne_dreamer_jax.nets import conv
+from ne_dreamer_jax.nets.blocks import MLP, kernel_init
+from ne_dreamer_jax.types import Array, ArraySpec
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Sizes of the encoder."""
+
+    depth: int = 16
+    """Channels of a stage are depth times its multiplier."""
+    multipliers: tuple[int, ...] = (2, 3, 4, 4)
+    """One convolution stage, which halves the sides, for each entry."""
+    kernel: int = 5
+    """Side of the convolution kernels."""
+    layers: int = 3
+    """Layers of the multilayer perceptron for vectors."""
+    units: int = 256
+    """Width of the multilayer perceptron for vectors, and its share of the embedding."""
+
+
+def split_observation(observation: Mapping[str, ArraySpec]) -> tuple[list[str], list[str]]:
+    """Names of the images (uint8, rank 3) and of the vectors (float32, rank 0 or 1), each sorted.
+
+    Raises ValueError for an array that is neither, and for no array at all.
+    """
+    images, vectors = [], []
+    for name, spec in sorted(observation.items()):
+        if len(spec.shape) == 3 and jnp.dtype(spec.dtype) == jnp.uint8:
+            images.append(name)
+        elif len(spec.shape) <= 1 and jnp.dtype(spec.dtype) == jnp.float32:
+            vectors.append(name)
+        else:
+            raise ValueError(
+                f"Observation {name!r}: expected a uint8 image [height, width, channels] or a float32 vector of rank "
+                f"0 or 1, got {jnp.dtype(spec.dtype).name} {list(spec.shape)}. Convert it in the environment."
+            )
+    if not images and not vectors:
+        raise ValueError("Expected at least one observation, got none.")
+    return images, vectors
+
+
+def embedding_size(config: EncoderConfig, observation: Mapping[str, ArraySpec]) -> int:
+    """E, the size of an embedding. Raises ValueError where an image's sides can't be halved often enough."""
+    images, vectors = split_observation(observation)
+    size = config.units if vectors else 0
+    if images:
+        shapes = {observation[name].shape[:2] for name in images}
+        factor = 2 ** len(config.multipliers)
+        if len(shapes) > 1 or any(side % factor for side in next(iter(shapes))):
+            raise ValueError(
+                f"Images: expected one common height and width, each a multiple of {factor}, got "
+                f"{ {name: list(observation[name].shape) for name in images} }. Resize them in the environment."
+            )
+        height, width = next(iter(shapes))
+        size += (height // factor) * (width // factor) * config.depth * config.multipliers[-1]
+    return size
+
+
+class Encoder(nn.Module):
+    """Convolution stages for images, a multilayer perceptron on symlog for vectors; the two concatenated.
+
+    A stage is a convolution (stride 1, same padding, bias), 2x2 max-pool, RMSNorm over channels and SiLU.
+    """
+
+    config: EncoderConfig
+    observation: Mapping[str, ArraySpec]
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, obs: Mapping[str, Array]) -> Array:
+        """``obs`` with any leading axes ``[...]`` to float32 ``[..., E]``."""
+        images, vectors = split_observation(self.observation)
+        some = (images + vectors)[0]
+        leading = obs[some].shape[: obs[some].ndim - len(self.observation[some].shape)]
+        parts = []
+        if images:
+            x = jnp.concatenate([obs[name].reshape(-1, *self.observation[name].shape) for name in images], axis=-1)
+            parts.append(conv.encode_images(x, self._stages(x.shape[-1]), self.dtype).reshape(*leading, -1))
+        if vectors:
+            flat = [obs[name].reshape(*leading, -1) for name in vectors]
+            x = symlog(jnp.concatenate(flat, axis=-1))
+            parts.append(MLP(self.config.layers, self.config.units, self.dtype, name="mlp")(x))
+        return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
+
+    def _stages(self, channels: int) -> list[conv.Stage]:
+        stages = []
+        for i, multiplier in enumerate(self.config.multipliers):
+            out = self.config.depth * multiplier
+            shape = (self.config.kernel, self.config.kernel, channels, out)
+            stages.append(
+                conv.Stage(
+                    kernel=self.param(f"stage{i}_kernel", kernel_init(), shape, jnp.float32),
+                    bias=self.param(f"stage{i}_bias", initializers.zeros_init(), (out,), jnp.float32),
+                    scale=self.param(f"stage{i}_scale", initializers.ones_init(), (out,), jnp.float32),
+                )
+            )
+            channels = out
+        return stages

@@ -1,0 +1,131 @@
+"""The causal temporal transformer of the paper: ``e-hat_{t+1} = T(h_<=t, z_<=t, a_<=t)``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.linen import initializers
+
+from ne_dreamer_jax.nets.blocks import Linear
+from ne_dreamer_jax.types import Array
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """Sizes of the predictor."""
+
+    layers: int = 2
+    """Transformer layers; 0 is the ablation without a transformer: a perceptron on each step alone."""
+    width: int = 256
+    heads: int = 4
+    feedforward: int = 1024
+    positions: int = 128
+    """Longest sequence, in steps; a step is two tokens, each with a learned position."""
+    projector: bool = True
+    """A bias-free linear layer F to E before the tokens' own linear layer. Without it the function class is the
+    same; what changes is the optimisation (the paper's w/o projector)."""
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ValueError(
+                f"objective.predictor.width must be a multiple of its heads, got {self.width} and {self.heads}; the "
+                f"nearest above is {-(-self.width // self.heads) * self.heads}."
+            )
+
+
+def check_length(config: PredictorConfig, length: int) -> None:
+    """Raises ValueError where a sequence of ``length`` steps exceeds the learned positions."""
+    if config.layers and length > config.positions:
+        raise ValueError(
+            f"Sequences of {length} steps, but the predictor has positions for {config.positions}. Shorten "
+            f"agent.batch_length or raise agent.objective.predictor.positions."
+        )
+
+
+def episode_causal_mask(is_first: Array, *, across_episodes: bool = False) -> Array:
+    """Which tokens see which: bool [B, 2T, 2T] for the interleaved tokens state, action, state, action.
+
+    A token sees those at or before it whose step lies in the same episode, episodes being split at ``is_first``
+    [B, T]; with ``across_episodes`` all at or before it.
+    """
+    tokens = 2 * is_first.shape[1]
+    causal = jnp.tril(jnp.ones((1, tokens, tokens), bool))
+    if across_episodes:
+        return jnp.broadcast_to(causal, (is_first.shape[0], tokens, tokens))
+    episode = jnp.repeat(jnp.cumsum(is_first.astype(jnp.int32), axis=1), 2, axis=1)
+    return causal & (episode[:, :, None] == episode[:, None, :])
+
+
+class LayerNorm(nn.Module):
+    """LayerNorm over the last axis in float32, returned in ``dtype``."""
+
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32, name="norm")(x.astype(jnp.float32)).astype(self.dtype)
+
+
+class TransformerLayer(nn.Module):
+    """Pre-norm attention and feed-forward: ``[B, L, width]`` with ``mask`` bool [B, L, L]."""
+
+    config: PredictorConfig
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Array, mask: Array) -> Array:
+        c = self.config
+        qkv = Linear(3 * c.width, dtype=self.dtype, name="qkv")(LayerNorm(self.dtype, name="attention_norm")(x))
+        query, key, value = jnp.split(qkv.reshape(*x.shape[:-1], 3 * c.heads, c.width // c.heads), 3, axis=-2)
+        with jax.numpy_dtype_promotion("standard"):  # it promotes bfloat16 to float32 for the logits
+            attended = jax.nn.dot_product_attention(query, key, value, mask=mask[:, None])
+        x = x + Linear(c.width, dtype=self.dtype, name="out")(attended.reshape(x.shape))
+        y = Linear(c.feedforward, dtype=self.dtype, name="up")(LayerNorm(self.dtype, name="feedforward_norm")(x))
+        return x + Linear(c.width, dtype=self.dtype, name="down")(nn.gelu(y, approximate=False))
+
+
+class Predictor(nn.Module):
+    """Predicts an embedding at every step from the states and actions up to it, within the episode."""
+
+    config: PredictorConfig
+    embedding: int
+    discrete: bool
+    across_episodes: bool = False
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, feature: Array, action: Array, is_first: Array) -> Array:
+        """``feature`` [B, T, F], ``action`` [B, T, A] and ``is_first`` [B, T] to float32 [B, T, E].
+
+        Raises ValueError where T exceeds the learned positions.
+        """
+        c, dtype = self.config, self.dtype
+        state = feature
+        if c.projector:
+            state = Linear(self.embedding, use_bias=False, dtype=dtype, name="projector")(state)
+        state = Linear(c.width, dtype=dtype, name="state_in")(state)
+        if self.discrete:
+            act = Linear(c.width, use_bias=False, dtype=dtype, name="action_in")(action)
+        else:
+            act = Linear(c.width, dtype=dtype, name="action_in")(action)
+            act = nn.gelu(LayerNorm(dtype, name="action_norm")(act), approximate=False)
+        x = state + act if c.layers == 0 else self._attend(state, act, is_first)
+        x = Linear(c.width, dtype=dtype, name="hidden")(LayerNorm(dtype, name="out_norm")(x))
+        x = Linear(self.embedding, dtype=dtype, name="out")(nn.gelu(x, approximate=False))
+        return x.astype(jnp.float32)
+
+    def _attend(self, state: Array, act: Array, is_first: Array) -> Array:
+        c = self.config
+        batch, length, width = state.shape
+        check_length(c, length)
+        x = jnp.stack([state, act], axis=2).reshape(batch, 2 * length, width)
+        positions = self.param("positions", initializers.normal(0.02), (2 * c.positions, c.width), jnp.float32)
+        x = x + positions[None, : 2 * length].astype(self.dtype)
+        mask = episode_causal_mask(is_first, across_episodes=self.across_episodes)
+        for i in range(c.layers):
+            x = TransformerLayer(c, self.dtype, name=f"layer{i}")(x, mask)
+        return x[:, 1::2]

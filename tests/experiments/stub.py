@@ -1,0 +1,80 @@
+"""A run that compiles in no time: the host's part of training sees a loop like any other, whose learner is a coin."""
+
+from __future__ import annotations
+
+import functools
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import training
+from ne_dreamer_jax.loop import Counters, Evaluation, Loop, LoopState
+from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, ReturnScale, TrainState
+from tests.experiments import toy
+
+EPISODE = 8  # vector steps
+
+
+def build(config, *, image: bool = True) -> training.Run:
+    """A run of a configuration."""
+    n = config.loop.num_envs
+    total = config.loop.env_steps // n
+    prefill = config.loop.prefill // n
+    observation = {"image": ArraySpec((16, 16, 3), jnp.uint8)} if image else {"position": ArraySpec((1,), jnp.float32)}
+
+    def init(key: Array) -> LoopState:
+        start_key, key = jax.random.split(key)
+        zeros = [jnp.zeros((), jnp.int32) for _ in range(3)]  # apart, since the state is donated
+        params = {"actor": {"kernel": jax.random.normal(start_key, (3,))}}
+        scale = ReturnScale(jnp.zeros(()), jnp.zeros(()))
+        train = TrainState(params, {}, {}, (), scale, jnp.copy(start_key), zeros[0])
+        replay = jnp.zeros((total, n), jnp.uint8)
+        return LoopState(train, (), (), (), replay, (), Counters(*zeros[1:]), key)  # type: ignore[arg-type]
+
+    def step(state: LoopState) -> LoopState:
+        key, noise_key = jax.random.split(state.key)
+        done = state.counters.vector_step
+        kernel = 0.9 * state.train.params["actor"]["kernel"] + jax.random.normal(noise_key, (3,))
+        update = state.train.update + (done >= prefill).astype(jnp.int32)
+        train = state.train._replace(params={"actor": {"kernel": kernel}}, update=update)
+        replay = state.replay.at[done].set(jax.random.bits(noise_key, (n,), jnp.uint8))
+        return state._replace(train=train, replay=replay, counters=Counters(done + 1, done), key=key)
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def chunk(state: LoopState, steps: Array):
+        before = state.counters.vector_step
+        state = jax.lax.fori_loop(0, steps, lambda _, state: step(state), state)
+        kernel = jnp.sum(state.train.params["actor"]["kernel"])
+        episodes = (n * (state.counters.vector_step // EPISODE - before // EPISODE)).astype(jnp.float32)
+        metrics = {
+            "loss/total": jnp.square(kernel),
+            "return": kernel / episodes * episodes,
+            "length": episodes / episodes,
+        }
+        return state, metrics | {"episodes": episodes}
+
+    def evaluate(params, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False):
+        count = episodes or config.loop.eval_episodes
+        mean = 0.0 if random else jnp.sum(params["actor"]["kernel"])
+        clip = np.zeros((5, 16, 16, 3), np.uint8) if frames and image else None
+        return Evaluation(mean + jax.random.normal(key, (count,)), jnp.full((count,), EPISODE, jnp.int32), clip)
+
+    agent = SimpleNamespace(spec=EnvSpec(observation, ContinuousAction(1)))
+    loop = Loop(
+        init,
+        chunk,
+        evaluate,
+        replay_bytes=total * n,
+        capacity=total * n,
+        chunk_steps=config.loop.chunk_steps,
+        vector_steps=total,
+        updates=total - prefill,
+    )
+    return training.Run(config, agent, loop, jax.eval_shape(init, jax.random.key(0)))  # type: ignore[arg-type]
+
+
+def run() -> training.Run:
+    """A run of the toy configuration."""
+    return build(toy.config())

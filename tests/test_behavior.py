@@ -1,0 +1,214 @@
+"""Imagination, and the actor's and critic's losses against a float64 oracle."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from ne_dreamer_jax import behavior, world_model
+from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.losses import symexp_bins
+from ne_dreamer_jax.nets.rssm import RSSM
+from ne_dreamer_jax.types import Latent, ReturnScale
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+KEY = jax.random.key(3)
+CONFIG = BehaviorConfig(horizon=3, discount=0.9, lam=0.8, entropy=0.1, slow_scale=0.5, return_decay=0.5)
+H, B, T = 3, 2, 5
+OLD_SCALE = ReturnScale(jnp.asarray(-1.0), jnp.asarray(4.0))
+
+
+def make(spec, config):
+    nets = tiny.networks(spec)
+    params, slow = tiny.params(nets), tiny.params(nets, seed=1)["critic"]
+    batch = tiny.batch(spec)
+
+    def compute(params, slow, batch, key):
+        rollout, _ = world_model.posterior_rollout(nets, params, jax.random.key(0), batch)
+        out = behavior.actor_critic_losses(nets, config, params, slow, OLD_SCALE, key, rollout)
+        return out[0], (out, rollout)
+
+    return SimpleNamespace(nets=nets, params=params, slow=slow, batch=batch, compute=compute)
+
+
+def frozen_trajectory(nets, params, rollout, key):
+    """What is imagined from every replayed state, and the latents' other view: the states' deterministic part."""
+    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
+    return start, behavior.imagine(nets, params, key, start, H)
+
+
+@pytest.fixture(scope="module")
+def reinforce():
+    """Losses of the score-function actor, their gradients, and what the oracle below needs."""
+    model = make(tiny.VECTORS, CONFIG)
+    nets = model.nets
+
+    @jax.jit
+    def run(params, slow, batch):
+        gradients, (out, rollout) = jax.jacrev(lambda p: model.compute(p, slow, batch, KEY), has_aux=True)(params)
+        start, trajectory = frozen_trajectory(nets, params, rollout, KEY)
+        heads = {
+            name: nets.apply(name, params, trajectory.feature) for name in ("actor", "critic", "reward", "continue")
+        }
+        heads["slow"] = nets.apply("critic", {"critic": slow}, trajectory.feature)
+        replayed = {"critic": nets.apply("critic", params, rollout.feature)}
+        replayed["slow"] = nets.apply("critic", {"critic": slow}, rollout.feature)
+        rssm = lambda latent, action: nets.rssm.apply(
+            {"params": params["rssm"]}, latent, action, method=lambda m, x, a: m.recur(x, m.embed_action(a))
+        )
+        follows = rssm(start, jnp.clip(trajectory.action[0], -1, 1))
+        return gradients, out, rollout, start, trajectory, heads, replayed, follows
+
+    names = ("gradients", "out", "rollout", "start", "trajectory", "heads", "replayed", "follows")
+    return SimpleNamespace(**dict(zip(names, run(model.params, model.slow, model.batch), strict=True)), **vars(model))
+
+
+def test_imagination_starts_at_the_replayed_states_and_follows_clipped_actions(reinforce):
+    trajectory, nets = reinforce.trajectory, reinforce.nets
+    assert trajectory.feature.shape == (H + 1, B * T, nets.feature)
+    assert trajectory.action.shape == (H, B * T, 2)
+    start = np.asarray(reinforce.rollout.feature).reshape(B * T, -1)
+    np.testing.assert_array_equal(trajectory.feature[0], start)
+    assert np.abs(trajectory.action).max() > 1  # raw
+    np.testing.assert_allclose(trajectory.feature[1][:, 16:], reinforce.follows, atol=1e-5)
+    stoch = np.asarray(trajectory.feature[..., :16]).reshape(H + 1, B * T, 4, 4)
+    np.testing.assert_array_equal(stoch.sum(-1), 1)
+
+
+def mean_of(logits):
+    """Mean of the two-hot distribution, float64."""
+    logits = np.asarray(logits, np.float64)
+    p = np.exp(logits - logits.max(-1, keepdims=True))
+    return (p / p.sum(-1, keepdims=True)) @ np.asarray(symexp_bins(15), np.float64)
+
+
+def two_hot(logits, target):
+    """Cross-entropy with the two-hot distribution of a number, one at a time."""
+    bins = np.asarray(symexp_bins(15), np.float64)
+    logits = np.asarray(logits, np.float64)
+    log_p = logits - np.logaddexp.reduce(logits, axis=-1)[..., None]
+    out = np.empty(target.shape)
+    for i in np.ndindex(target.shape):
+        k = min(np.searchsorted(bins, target[i], side="right") - 1, len(bins) - 2)
+        upper = (target[i] - bins[k]) / (bins[k + 1] - bins[k])
+        out[i] = -(1 - upper) * log_p[i][k] - upper * log_p[i][k + 1]
+    return out
+
+
+@pytest.fixture(scope="module")
+def oracle(reinforce):
+    """Time first, as they were imagined."""
+    heads = reinforce.heads
+    reward, value, slow = mean_of(heads["reward"]), mean_of(heads["critic"]), mean_of(heads["slow"])
+    go_on = 1 / (1 + np.exp(-np.asarray(heads["continue"][..., 0], np.float64)))  # the discount is inside
+    returns = [value[H]]
+    for t in reversed(range(H)):
+        returns.insert(0, reward[t + 1] + go_on[t + 1] * ((1 - 0.8) * value[t + 1] + 0.8 * returns[0]))
+    returns = np.stack(returns[:H])  # the last is reward[H] + go_on[H] * value[H]
+    weight = np.cumprod(go_on, axis=0)[:H]
+    low, high = (0.5 * float(old) + 0.5 * np.percentile(returns, q) for old, q in zip(OLD_SCALE, (5, 95), strict=True))
+    return SimpleNamespace(value=value, slow=slow, returns=returns, weight=weight, low=low, high=high)
+
+
+def test_return_scale_is_a_moving_range_of_percentiles(reinforce, oracle):
+    scale = reinforce.out[1]
+    np.testing.assert_allclose(scale, (oracle.low, oracle.high), rtol=1e-3)
+    assert oracle.high - oracle.low > 1
+    np.testing.assert_allclose(reinforce.out[2]["imagined/return_scale"], oracle.high - oracle.low, rtol=1e-3)
+
+
+def test_actor_loss_equals_the_oracle(reinforce, oracle):
+    outputs, raw = (np.asarray(x, np.float64) for x in (reinforce.heads["actor"][:H], reinforce.trajectory.action))
+    mean, std = np.split(outputs, 2, axis=-1)
+    normal = stats.norm(np.tanh(mean), 0.1 + 0.9 / (1 + np.exp(-(std + 2))))
+    advantage = (oracle.returns - oracle.value[:H]) / max(1, oracle.high - oracle.low)
+    want = -oracle.weight * (advantage * normal.logpdf(raw).sum(-1) + 0.1 * normal.entropy().sum(-1))
+    np.testing.assert_allclose(reinforce.out[0]["actor"], want.mean(), rtol=1e-3)
+
+
+def test_critic_loss_equals_the_oracle(reinforce, oracle):
+    logits = reinforce.heads["critic"][:H]
+    want = oracle.weight * (two_hot(logits, oracle.returns) + 0.5 * two_hot(logits, oracle.slow[:H]))
+    np.testing.assert_allclose(reinforce.out[0]["critic"], want.mean(), rtol=1e-3)
+
+
+def test_replayed_critic_loss_equals_the_oracle(reinforce, oracle):
+    batch = reinforce.batch
+    reward, last, terminal = (np.asarray(x, np.float64) for x in (batch.reward, batch.is_last, batch.is_terminal))
+    bootstrap = oracle.returns[0].reshape(B, T)
+    returns = bootstrap.copy()
+    for t in reversed(range(T - 1)):
+        lam = 0.8 * (1 - last[:, t + 1]) if t < T - 2 else 0.0
+        ahead = (1 - lam) * bootstrap[:, t + 1] + lam * returns[:, t + 1]
+        returns[:, t] = reward[:, t + 1] + 0.9 * (1 - terminal[:, t + 1]) * ahead
+    logits, slow = reinforce.replayed["critic"][:, :-1], mean_of(reinforce.replayed["slow"])[:, :-1]
+    want = (1 - last[:, :-1]) * (two_hot(logits, returns[:, :-1]) + 0.5 * two_hot(logits, slow))
+    assert last[:, :-1].any()
+    np.testing.assert_allclose(reinforce.out[0]["replay_critic"], want.mean(), rtol=1e-3)
+
+
+def trained(gradients):
+    return {name: {part for part, g in tree.items() if not tiny.is_zero(g)} for name, tree in gradients.items()}
+
+
+WHAT_TRAINS_WHAT = {"actor": {"actor"}, "critic": {"critic"}, "replay_critic": {"critic", "encoder", "rssm"}}
+
+
+def test_imagined_losses_train_actor_and_critic_alone_and_the_replayed_one_the_model_too(reinforce):
+    assert tuple(reinforce.out[0]) == behavior.LOSSES
+    assert trained(reinforce.gradients) == WHAT_TRAINS_WHAT
+
+
+@pytest.mark.parametrize("spec", [tiny.VECTORS, tiny.DISCRETE], ids=["continuous", "discrete"])
+def test_the_dynamics_gradient_comes_through_the_world_model(spec):
+    # Without entropy the policy is trained by nothing but the returns that its actions lead to.
+    model = make(spec, replace(CONFIG, gradient="dynamics", entropy=0.0))
+
+    @jax.jit
+    def run(params, reward_head):
+        params = {**params, "reward": reward_head}
+        return jax.jacrev(lambda p: model.compute(p, model.slow, model.batch, KEY)[0])(params)
+
+    gradients = run(model.params, model.params["reward"])
+    assert trained(gradients) == WHAT_TRAINS_WHAT
+    # What the model says of rewards changes it.
+    other = run(model.params, tiny.fill(model.params["reward"], seed=4))
+    assert not np.allclose(*(g["actor"]["actor"]["out"]["kernel"] for g in (gradients, other)))
+
+
+def test_returns_are_normalised_by_no_less_than_the_floor():
+    model = make(tiny.VECTORS, replace(CONFIG, return_floor=1e6))
+    metrics = jax.jit(lambda: model.compute(model.params, model.slow, model.batch, KEY)[1][0][2])()
+    assert metrics["imagined/return_scale"] == 1e6
+
+
+def test_the_gradient_has_a_known_name():
+    with pytest.raises(ValueError, match=r"behavior.gradient: expected 'reinforce' or 'dynamics', got 'dynamic'"):
+        BehaviorConfig(gradient="dynamic")  # type: ignore[arg-type]
+
+
+def test_imagined_latents_are_samples_of_the_prior():
+    nets = tiny.networks(tiny.VECTORS)
+    params = tiny.params(nets)
+    start = jax.tree.map(lambda x: jnp.tile(x, (4_000,) + (1,) * (x.ndim - 1)), tiny.latent((1,)))
+
+    @jax.jit
+    def step(params, start):
+        uniform = jax.random.uniform(KEY, (4_000, 4))
+        latent = nets.rssm.apply(
+            {"params": params["rssm"]}, start, jnp.zeros((4_000, 2)), uniform, method=RSSM.imagine_step
+        )
+        return latent, nets.rssm.apply({"params": params["rssm"]}, latent.deter[:1], method=RSSM.prior)
+
+    latent, logits = step(params, start)
+    assert isinstance(latent, Latent)
+    probs = np.exp(np.asarray(logits[0], np.float64))
+    probs = 0.99 * probs / probs.sum(-1, keepdims=True) + 0.01 / 4
+    for s in range(4):
+        assert stats.chisquare(np.asarray(latent.stoch[:, s]).sum(0), 4_000 * probs[s]).pvalue > 1e-3

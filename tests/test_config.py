@@ -1,0 +1,304 @@
+"""Presets and methods, and that no setting is without effect."""
+
+import json
+import typing
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from experiments.schedule import Schedule
+from ne_dreamer_jax import config as configs
+from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax import make_agent, names, optim, replay, settings, world_model
+from ne_dreamer_jax.agent import BASE_LOSS_SCALES
+from ne_dreamer_jax.behavior import actor_critic_losses
+from ne_dreamer_jax.config import Config, EnvConfig
+from ne_dreamer_jax.loop import LoopConfig
+from ne_dreamer_jax.objectives import NextEmbedding
+from ne_dreamer_jax.types import ReturnScale, Rollout
+from tests import counting, tiny
+from tests.tiny import program
+
+KEY = jax.random.key(0)
+
+
+def test_commands_know_the_names_without_loading_the_registries():
+    assert tuple(configs.METHODS) == names.METHODS
+    assert tuple(configs.PRESETS) == names.PRESETS
+    assert tuple(configs.SIZES) == names.SIZES
+    assert typing.get_args(typing.get_type_hints(EnvConfig)["obs"]) == names.OBSERVATIONS
+
+
+@pytest.mark.parametrize("name", names.PRESETS)
+def test_presets_build_at_every_size_and_survive_json(name):
+    for size in (None, *names.SIZES):
+        config = configs.preset(name, size)
+        assert settings.from_dict(Config, json.loads(json.dumps(settings.to_dict(config)))) == config
+        if size is not None:
+            assert config.agent.rssm.deter == configs.SIZES[size]["deter"]
+            assert config.agent.heads.units == config.agent.encoder.units == configs.SIZES[size]["units"]
+    make_agent(configs.preset(name).agent, tiny.VECTORS)
+
+
+@pytest.mark.parametrize("method", names.METHODS)
+def test_methods_are_values_of_the_objective(method):
+    base = configs.preset("dmc")
+    config = configs.with_method(base, method)
+    assert config.method == method
+    assert settings.from_dict(Config, json.loads(json.dumps(settings.to_dict(config)))) == config
+    changed = {path for path, value in settings.paths(config).items() if value != settings.paths(base)[path]}
+    ablation = {
+        "ne_dreamer": set(),
+        "ne_dreamer/no_transformer": {"method", "agent.objective.predictor.layers"},
+        "ne_dreamer/no_shift": {"method", "agent.objective.shift"},
+        "ne_dreamer/no_projector": {"method", "agent.objective.predictor.projector"},
+    }
+    assert changed == ablation[method]
+    make_agent(config.agent, tiny.VECTORS)
+    assert configs.with_method(config, "ne_dreamer") == base
+
+
+def test_the_defaults_are_the_papers():
+    agent, loop = configs.preset("dmc").agent, configs.preset("dmc").loop
+    assert (agent.batch_size, agent.batch_length, loop.num_envs, loop.replay_ratio) == (16, 64, 16, 512)
+    assert (agent.rssm.stoch, agent.behavior.horizon, agent.behavior.lam, agent.behavior.entropy) == (
+        32,
+        15,
+        0.95,
+        3e-4,
+    )
+    optimizer = agent.optimizer
+    assert (optimizer.name, optimizer.learning_rate, optimizer.eps, optimizer.agc) == ("adam", 4e-5, 1e-20, 0.3)
+    predictor = agent.objective.predictor
+    assert (predictor.layers, predictor.width, predictor.heads) == (2, 256, 4)
+    assert agent.objective == NextEmbedding()
+    assert agent.loss_scales == {**BASE_LOSS_SCALES, "next_embedding": 1.0}
+    # "Replayed steps per policy step": what the run replays over what it acts, once it learns.
+    env = counting.env()
+    budget = loops.make(loop, env, counting.stub(env.spec, 16, 64), 2)
+    acting = budget.vector_steps * 16 - loop.prefill
+    assert budget.updates * 16 * 64 / acting == pytest.approx(512, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: configs.preset("quickstrat"), "no preset is called 'quickstrat'. Did you mean quickstart?"),
+        (lambda: configs.preset("dmc", "12"), "no size is called '12'. Did you mean .*12m"),
+        (lambda: configs.agent_config("13m"), "no size is called '13m'. Did you mean"),
+        (
+            lambda: configs.with_method(Config(), "ne_dreamer/no_transfomer"),
+            "no method is called .* Did you mean ne_dreamer/no_transformer",
+        ),
+    ],
+)
+def test_unknown_names_bring_the_nearest(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# Every setting changes something.
+
+BASE = Config(
+    agent=tiny.CONFIG, loop=LoopConfig(env_steps=600, num_envs=3, replay_ratio=1.0, prefill=30, eval_every=200)
+)
+
+CHANGES = {
+    "agent.encoder": {"depth": "2", "multipliers": "2,2", "kernel": "5", "layers": "2", "units": "4"},
+    "agent.rssm": {
+        "deter": "16",
+        "stoch": "3",
+        "classes": "3",
+        "hidden": "4",
+        "blocks": "2",
+        "prior_layers": "2",
+        "unimix": "0.02",
+    },
+    "agent.heads": {
+        "units": "4",
+        "reward_layers": "2",
+        "continue_layers": "2",
+        "actor_layers": "2",
+        "critic_layers": "2",
+        "bins": "11",
+        "actor_scale": "0.5",
+        "min_std": "0.2",
+        "max_std": "0.8",
+        "unimix": "0.02",
+    },
+    "agent.world_model": {"free_nats": "0.5", "kl_unimix": "0"},
+    "agent.objective": {
+        "predictor.layers": "0",
+        "predictor.width": "4",
+        "predictor.heads": "1",
+        "predictor.feedforward": "8",
+        "predictor.positions": "9",
+        "predictor.projector": "false",
+        "shift": "0",
+        "redundancy": "0.1",
+        "action": "previous",
+        "masked": "false",
+        "across_episodes": "true",
+    },
+    "agent.behavior": {
+        "horizon": "2",
+        "discount": "0.85",
+        "lam": "0.9",
+        "entropy": "0.1",
+        "gradient": "dynamics",
+        "slow_scale": "0.5",
+        "return_decay": "0.9",
+        "return_percentiles": "10,95",
+        "return_floor": "2",
+    },
+    "agent.optimizer": {
+        "name": "laprop",
+        "learning_rate": "1e-4",
+        "beta1": "0.8",
+        "beta2": "0.99",
+        "eps": "1e-8",
+        "agc": "0.2",
+        "agc_pmin": "1e-2",
+        "warmup": "3",
+    },
+    "agent": {
+        "batch_size": "3",
+        "batch_length": "6",
+        "compute_dtype": "bfloat16",
+        "behavior.slow_rate": "0.1",
+        **{f"loss_scales.{name}": "0.7" for name in tiny.CONFIG.loss_scales},
+    },
+    "loop": {
+        "env_steps": "700",
+        "num_envs": "4",
+        "replay_ratio": "2.5",
+        "capacity": "100",
+        "prefill": "60",
+        "chunk_steps": "5",
+        "eval_every": "300",
+        "eval_episodes": "3",
+        "write_latents": "false",
+        "latent_dtype": "bfloat16",
+    },
+}
+
+
+def networks(config):
+    """Initialisation and acting, of both kinds of policy."""
+    agent = config.agent
+    for spec in (tiny.BOTH, tiny.DISCRETE):
+        nets = tiny.networks(spec, agent)
+        yield str(jax.eval_shape(nets.init, KEY))
+    yield program(tiny.networks(tiny.BOTH, agent).init, KEY)
+    yield from (acting(agent, spec) for spec in (tiny.VECTORS, tiny.DISCRETE))
+
+
+def acting(agent, spec):
+    made, step = make_agent(agent, spec), tiny.batch(spec, (1, 1))
+    step = jax.tree.map(lambda x: x[:, 0], step._replace(context=None))
+    params = jax.eval_shape(tiny.networks(spec, agent).init, KEY)
+    return program(lambda params: made.act(params, made.init_policy(1), step, KEY), params)
+
+
+def rollout_of(nets):
+    """A rollout made of zeros, and posterior logits."""
+    batch = tiny.batch(tiny.VECTORS)
+    latent = tiny.latent((2, 5))
+    action = jnp.zeros((2, 5, 2))
+    feature = jnp.zeros((2, 5, nets.feature))
+    return Rollout(batch, jnp.zeros((2, 5, nets.embedding)), latent, feature, action, action + 1)
+
+
+def world(config):
+    """The model's losses."""
+    nets = tiny.networks(tiny.VECTORS)
+    params = jax.eval_shape(nets.init, KEY)
+    rollout, logits = rollout_of(nets), jnp.zeros((2, 5, 4, 4))
+    losses = lambda p: world_model.prediction_losses(nets, config.agent.world_model, p, rollout, logits, 0.9)
+    yield program(losses, params)
+
+
+def objective(config):
+    """The objective's parameters and loss."""
+    nets = tiny.networks(tiny.VECTORS)
+    functions = config.agent.objective.build(tiny.sizes(nets))
+    params = {"objective": jax.eval_shape(functions.init, KEY)}
+    yield str(params)
+    rollout = rollout_of(nets)
+    yield program(
+        lambda p, action, prev: functions.loss(p, {}, KEY, rollout._replace(action=action, prev_action=prev)),
+        params,
+        rollout.action,
+        rollout.prev_action,
+    )
+
+
+def behavior(config):
+    """The behaviour's losses."""
+    nets = tiny.networks(tiny.VECTORS)
+    params = jax.eval_shape(nets.init, KEY)
+    rollout, scale = rollout_of(nets), ReturnScale(jnp.zeros(()), jnp.zeros(()))
+    yield program(
+        lambda p: actor_critic_losses(nets, config.agent.behavior, p, p["critic"], scale, KEY, rollout), params
+    )
+
+
+def optimizer(config):
+    """The update rule."""
+    transform = optim.make(config.agent.optimizer)
+    x = {"x": jnp.ones((2, 3))}
+    yield program(lambda x: transform.update(x, transform.init(x), x), x)
+
+
+def train_step(config):
+    """Batches and the whole update."""
+    batch = jax.eval_shape(lambda: replay.random_batch(tiny.VECTORS, config.agent, KEY))
+    yield str(batch)
+    agent = make_agent(config.agent, tiny.VECTORS)
+    yield program(agent.train_step, jax.eval_shape(agent.init, KEY), batch)
+
+
+def loop(config):
+    """Sizes, the schedule and the compiled program."""
+    env = counting.env(image=False)
+    made = loops.make(config.loop, env, counting.stub(env.spec), 2)
+    yield str((made.vector_steps, made.updates, made.capacity, made.replay_bytes, config.loop.eval_episodes))
+    yield str(Schedule.of(config, made))
+    state = jax.eval_shape(made.init, KEY)
+    yield program(made.chunk, state, jnp.zeros((), jnp.int32))
+
+
+PROBES = {
+    "agent.encoder": networks,
+    "agent.rssm": networks,
+    "agent.heads": networks,
+    "agent.world_model": world,
+    "agent.objective": objective,
+    "agent.behavior": behavior,
+    "agent.optimizer": optimizer,
+    "agent": train_step,
+    "loop": loop,
+}
+
+
+def test_every_setting_is_listed_below():
+    listed = {f"{group}.{name}" for group, fields in CHANGES.items() for name in fields}
+    assert listed == {path for path in settings.paths(BASE) if path.startswith(("agent.", "loop."))}
+
+
+@pytest.mark.parametrize("group", CHANGES)
+def test_every_setting_changes_something(group):
+    base, known = PROBES[group](BASE), []
+
+    def before(i):
+        while len(known) <= i:
+            known.append(next(base))
+        return known[i]
+
+    without_effect = []
+    for name, value in CHANGES[group].items():
+        changed = settings.override(BASE, f"{group}.{name}={value}")
+        if all(text == before(i) for i, text in enumerate(PROBES[group](changed))):
+            without_effect.append(name)
+    assert without_effect == []

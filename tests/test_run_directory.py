@@ -1,0 +1,110 @@
+"""A run directory belongs to one run; nothing else is ever touched."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from ne_dreamer_jax import run_directory
+from ne_dreamer_jax.run_directory import RefusedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    task: str = "dmc/walker_walk"
+    seed: int = 0
+
+
+def listing(path):
+    return {entry.name: entry.read_bytes() for entry in path.iterdir()}
+
+
+def test_the_same_configuration_goes_on_and_finds_everything_as_it_was(tmp_path):
+    path = tmp_path / "runs" / "a"
+    with run_directory.claim(path, Config()) as files:
+        files.metrics.write_text("kept\n")
+    before = listing(path)
+    with run_directory.claim(path, Config()):
+        assert listing(path) == before
+    assert set(before) == {".ne_dreamer_jax", "config.json", "metrics.jsonl"}
+    assert run_directory.read_config(path, Config) == Config()
+
+
+def test_an_empty_directory_is_taken(tmp_path):
+    with run_directory.claim(tmp_path, Config(seed=3)):
+        assert json.loads((tmp_path / "config.json").read_text()) == {"task": "dmc/walker_walk", "seed": 3}
+
+
+def test_another_run_is_refused_with_what_differs(tmp_path):
+    with run_directory.claim(tmp_path, Config()):
+        pass
+    before = listing(tmp_path)
+    with (
+        pytest.raises(RefusedError, match=r"holds another run(.|\n)*seed: 0, now 1"),
+        run_directory.claim(tmp_path, Config(seed=1)),
+    ):
+        pass
+    assert listing(tmp_path) == before
+
+
+def test_what_is_not_a_run_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(RefusedError, match=r"not a run \(thesis.tex\)"), run_directory.claim(tmp_path, Config()):
+        pass
+    assert listing(tmp_path) == {"thesis.tex": b"mine"}
+    with pytest.raises(RefusedError, match="expected a directory, got a file"):
+        run_directory.check(tmp_path / "thesis.tex")
+    with pytest.raises(RefusedError, match="can't be made a run directory"):
+        run_directory.claim(tmp_path / "thesis.tex" / "below", Config()).__enter__()
+
+
+def test_two_processes_do_not_share_a_run(tmp_path):
+    code = (
+        "import sys, time, pathlib; from tests.test_run_directory import Config; "
+        "from ne_dreamer_jax import run_directory\n"
+        "with run_directory.claim(pathlib.Path(sys.argv[1]), Config()): print('held', flush=True); sys.stdin.read()"
+    )
+    holder = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=os.getcwd()
+    )
+    with holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with (
+            pytest.raises(RefusedError, match="another process trains in"),
+            run_directory.claim(tmp_path, Config()),
+        ):
+            pass
+        holder.communicate(b"")
+    with run_directory.claim(tmp_path, Config()):
+        pass
+
+
+def test_a_crash_before_the_configuration_was_written_starts_anew(tmp_path):
+    (tmp_path / ".ne_dreamer_jax").touch()
+    (tmp_path / "config.json.partial").write_text('{"ta')
+    with run_directory.claim(tmp_path, Config()):
+        assert run_directory.read_config(tmp_path, Config) == Config()
+
+
+def test_reading_what_is_no_run_or_of_another_version(tmp_path):
+    with pytest.raises(RefusedError, match="expected a run directory"):
+        run_directory.read_config(tmp_path, Config)
+    with run_directory.claim(tmp_path, Config()):
+        pass
+    (tmp_path / "config.json").write_text('{"task": "dmc/walker_walk", "old": 1}')
+    with pytest.raises(RefusedError, match=r"does not fit this version.*missing \['seed'\], unknown \['old'\]"):
+        run_directory.read_config(tmp_path, Config)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(RefusedError, match="does not fit this version"):
+        run_directory.read_config(tmp_path, Config)
+
+
+def test_an_evaluation_replaces_the_one_before(tmp_path):
+    with run_directory.claim(tmp_path, Config()) as files:
+        run_directory.write_evaluation(files, {"return": 1.0})
+        run_directory.write_evaluation(files, {"return": 2.0})
+        assert json.loads(files.evaluation.read_text()) == {"return": 2.0}
