@@ -24,7 +24,8 @@ import numpy as np
 from scipy import stats
 
 from ne_dreamer_jax.envs import base, dmc, registry
-from ne_dreamer_jax.envs.dmc.common import Episode, Task
+from ne_dreamer_jax.envs.dmc import Task, environment
+from ne_dreamer_jax.envs.dmc.common import Episode
 
 Arrays = dict[str, np.ndarray]
 
@@ -191,7 +192,7 @@ def reset_p_values(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 def our_returns(name: str, num_episodes: int, seed: int = 0) -> np.ndarray:
     """Returns of the uniformly random policy in our environment."""
     task = load_task(name)
-    env = base.from_core(dmc.core(task, "vector", action_repeat=2, image_size=64))
+    env = base.from_core(environment.make_core(task, "vector", action_repeat=2, image_size=64))
     num_steps = round(task.time_limit / task.simulation.control_timestep / 2)
 
     def episode(key: jax.Array) -> jax.Array:

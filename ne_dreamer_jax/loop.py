@@ -112,8 +112,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     n, b, length = config.num_envs, agent.config.batch_size, agent.config.batch_length
     vector_steps = -(-config.env_steps // (n * action_repeat))
     ratio = Fraction(config.replay_ratio).limit_denominator(1_000)
-    if ratio == 0:
-        raise ValueError(f"loop.replay_ratio: expected at least 0.001, got {config.replay_ratio}")
+    if ratio == 0 and config.replay_ratio != 0:
+        raise ValueError(f"loop.replay_ratio: expected 0 (never learn) or at least 0.001, got {config.replay_ratio}")
     price = b * length * ratio.denominator  # of one update, in units of credit
     wage = n * ratio.numerator  # of one vector step
     prefill = max(-(-config.prefill // n), length + 1)
@@ -254,7 +254,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         evaluate=evaluate,
         replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
         capacity=capacity,
-        chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // wage)),
+        chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // max(wage, 1))),
         vector_steps=vector_steps,
         updates=updates,
     )

@@ -12,6 +12,7 @@ from ne_dreamer_jax import make_agent, replay
 from ne_dreamer_jax.agent import parameter_counts
 from ne_dreamer_jax.config import agent_config
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
+from ne_dreamer_jax.world_model import WorldModelConfig
 from tests import tiny
 from tests.tiny import assert_same
 
@@ -55,7 +56,9 @@ def test_a_fresh_state_is_float32_and_starts_at_zero():
 
 @pytest.fixture(scope="module")
 def update():
-    config = REPLACE(tiny.CONFIG, behavior=REPLACE(tiny.CONFIG.behavior, slow_rate=0.25))
+    behavior = REPLACE(tiny.CONFIG.behavior, slow_rate=0.25)
+    # Without free nats, since below them neither prior nor posterior is trained.
+    config = REPLACE(tiny.CONFIG, behavior=behavior, world_model=WorldModelConfig(free_nats=0.0))
     agent = make_agent(config, tiny.BOTH)
     batch = tiny.batch()
     before = jax.device_get(tiny.state(agent)._replace(key=None))
@@ -155,7 +158,7 @@ def test_bfloat16_products_change_the_losses_little(update):
 
 def timestep(spec, n, seed=0, first=()):
     batch = tiny.batch(spec, (n, 1), seed, [(i, 0) for i in first])
-    row = jax.tree.map(lambda x: x[:, 0], batch._replace(context=0))
+    row = jax.tree.map(lambda x: x[:, 0], batch._replace(context=()))
     return TimeStep(row.obs, row.reward, row.is_first, row.is_last, row.is_terminal)
 
 

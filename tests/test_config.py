@@ -56,7 +56,14 @@ def test_methods_are_values_of_the_objective(method):
     }
     assert changed == ablation[method]
     make_agent(config.agent, tiny.VECTORS)
-    assert configs.with_method(config, "ne_dreamer") == base
+
+
+@pytest.mark.parametrize("name", names.PRESETS)
+def test_a_method_keeps_the_sizes_of_a_preset(name):
+    preset = configs.preset(name)
+    assert configs.with_method(preset, "ne_dreamer") == preset
+    shiftless = configs.with_method(preset, "ne_dreamer/no_shift").agent.objective
+    assert shiftless.predictor == preset.agent.objective.predictor
 
 
 def test_the_defaults_are_the_papers():
@@ -195,7 +202,7 @@ def networks(config):
 
 
 def acting(agent, spec):
-    made, step = make_agent(agent, spec), tiny.batch(spec, (1, 1))
+    made, step = make_agent(agent, spec), tiny.batch(spec, (1, 1), first=[(0, 0)])
     step = jax.tree.map(lambda x: x[:, 0], step._replace(context=None))
     params = jax.eval_shape(tiny.networks(spec, agent).init, KEY)
     return program(lambda params: made.act(params, made.init_policy(1), step, KEY), params)

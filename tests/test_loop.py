@@ -83,7 +83,7 @@ def test_the_state_goes_on_where_replay_ends(filled):
     policy, last = filled.state.policy, jax.tree.map(lambda x: x[STEPS - 1], filled.data)
     np.testing.assert_array_equal(policy.prev_action, last.action)
     np.testing.assert_array_equal(policy.latent.deter, last.latent.deter)
-    np.testing.assert_array_equal(filled.state.timestep.is_first, last.is_last)
+    np.testing.assert_array_equal(filled.state.env.needs_reset, last.is_last)
 
 
 def test_reported_episodes_are_the_true_ones(filled):
@@ -94,7 +94,7 @@ def test_reported_episodes_are_the_true_ones(filled):
         for t in range(STEPS):
             if filled.data.is_last[t, env]:
                 returns.append(filled.data.reward[begin : t + 1, env].sum())
-                lengths.append(t + 1 - begin)
+                lengths.append(t - begin)  # the first observation took no step
                 begin = t + 1
     assert len(returns) > 2 * N
     assert filled.metrics["episodes"] == len(returns)
@@ -174,10 +174,10 @@ def test_latents_are_stored_in_the_chosen_dtype():
 
 
 def episodes_of_the_mode(names):
-    """Returns and lengths (in observations) of the stub's mode: action t / 4 at step t."""
+    """Returns and lengths (in steps) of the stub's mode: action t / 4 at step t."""
     length = counting.length_of(names)
     returns = [sum(counting.reward_of(t, min((t - 1) / 4, 1)) for t in range(1, n + 1)) for n in length]
-    return np.asarray(returns), length + 1
+    return np.asarray(returns), length
 
 
 def test_evaluation_returns_are_the_true_ones():
@@ -186,14 +186,14 @@ def test_evaluation_returns_are_the_true_ones():
     got = loop.evaluate(state.train.params, jax.random.key(7), frames=True)
     assert got.returns.shape == got.lengths.shape == (5,)
     # Which episodes these were follows from their lengths: 2, 3 or 4 steps.
-    names = np.asarray(got.lengths) - 3
+    names = np.asarray(got.lengths) - 2
     assert len(set(names)) > 1
     want, lengths = episodes_of_the_mode(names)
     np.testing.assert_allclose(got.returns, want, rtol=1e-6)
     np.testing.assert_array_equal(got.lengths, lengths)
     assert got.frames.dtype == np.uint8
     np.testing.assert_array_equal(
-        got.frames, np.broadcast_to(np.arange(lengths[0])[:, None, None, None], got.frames.shape)
+        got.frames, np.broadcast_to(np.arange(lengths[0] + 1)[:, None, None, None], got.frames.shape)
     )
     again = loop.evaluate(state.train.params, jax.random.key(7), episodes=5)
     assert_same((again.returns, again.lengths), (got.returns, got.lengths))

@@ -50,10 +50,10 @@ def test_a_rollout_holds_actions_as_the_models_see_them(model):
 
 
 def test_acting_takes_the_same_step_as_learning(model):
-    batch = jax.tree.map(lambda x: x[:, :1], model.batch._replace(context=0))._replace(context=model.batch.context)
+    batch = jax.tree.map(lambda x: x[:, :1], model.batch._replace(context=()))._replace(context=model.batch.context)
     want = model.rollout(model.params, batch)[0].latent
     policy = PolicyState(batch.context, batch.prev_action[:, 0])
-    row = jax.tree.map(lambda x: x[:, 0], batch._replace(context=0))
+    row = jax.tree.map(lambda x: x[:, 0], batch._replace(context=()))
     timestep = TimeStep(row.obs, row.reward, row.is_first, row.is_last, row.is_terminal)
     got = jax.jit(lambda params: world_model.posterior_step(model.nets, params, KEY, policy, timestep))(model.params)
     np.testing.assert_allclose(got.deter, want.deter[:, 0], atol=1e-5)

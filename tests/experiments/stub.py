@@ -31,7 +31,7 @@ def build(config, *, image: bool = True) -> training.Run:
         scale = ReturnScale(jnp.zeros(()), jnp.zeros(()))
         train = TrainState(params, {}, {}, (), scale, jnp.copy(start_key), zeros[0])
         replay = jnp.zeros((total, n), jnp.uint8)
-        return LoopState(train, (), (), (), replay, (), Counters(*zeros[1:]), key)  # type: ignore[arg-type]
+        return LoopState(train, (), (), replay, (), Counters(*zeros[1:]), key)  # type: ignore[arg-type]
 
     def step(state: LoopState) -> LoopState:
         key, noise_key = jax.random.split(state.key)

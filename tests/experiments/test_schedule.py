@@ -76,6 +76,7 @@ def test_the_time_left_counts_chunks_that_learned_and_evaluations_to_come():
 
 def test_one_signal_asks_and_the_second_insists():
     said = []
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with it ignored
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with Stop(said.append) as stop:
         assert stop.signal is None

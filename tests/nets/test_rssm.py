@@ -184,7 +184,7 @@ def test_latents_are_sampled_from_the_mixture_with_the_uniform():
     rssm = RSSM(RSSMConfig(8, 1, 4, 4, 2, unimix=0.2), E, A)
     logits = jnp.broadcast_to(jnp.asarray([40.0, 0.0, 0.0, 0.0]), (20_000, 1, 4))
     uniform = jax.random.uniform(jax.random.key(0), (20_000, 1))
-    sample = rssm.apply({"params": {}}, uniform, logits, method=lambda module, *args: RSSM.sample(module, *args))
+    sample, _ = rssm.init_with_output(jax.random.key(1), uniform, logits, method=RSSM.sample)
     counts = np.asarray(sample).sum((0, 1))
     assert stats.chisquare(counts, 20_000 * np.asarray([0.85, 0.05, 0.05, 0.05])).pvalue > 1e-3
 
@@ -202,7 +202,7 @@ def test_initial_latents_are_zero():
     assert initial_latent(CONFIG, (3, 2)).stoch.shape == (3, 2, 4, 4)
 
 
-def test_kernels_start_with_the_fan_in_of_the_whole_layer():
+def test_block_linear_kernels_start_with_the_fan_in_of_all_blocks():
     config = RSSMConfig(deter=64, stoch=2, classes=2, hidden=32, blocks=4, prior_layers=0)
     rssm = RSSM(config, 8, A)
 
@@ -213,7 +213,7 @@ def test_kernels_start_with_the_fan_in_of_the_whole_layer():
         return rssm.init_with_output(jax.random.key(0), method=kernels)[0]
 
     state, inputs, gates = (np.asarray(x) for x in init())
-    for kernel, fan_in in ((state, 16 + 96), (inputs, 16 + 96), (gates, 16)):
+    for kernel, fan_in in ((state, 4 * (16 + 96)), (inputs, 4 * (16 + 96)), (gates, 4 * 16)):
         np.testing.assert_allclose(kernel.std(), fan_in**-0.5, rtol=0.06)
         assert np.abs(kernel).max() <= 2 * 1.1369 * fan_in**-0.5
 

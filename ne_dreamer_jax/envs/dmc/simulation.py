@@ -17,6 +17,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from ne_dreamer_jax.types import Array
 
@@ -111,7 +112,9 @@ class Simulation:
         """The model's default state, at rest and settled."""
         data = mujoco.MjData(self.mj_model)
         mujoco.mj_step1(self.mj_model, data)
-        return mjx.put_data(self.mj_model, data)
+        # What no stage has computed yet is uninitialised memory, and may hold what no float32 can.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return mjx.put_data(self.mj_model, data)
 
     def in_contact(self, data: mjx.Data) -> Array:
         """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
@@ -138,7 +141,7 @@ class Simulation:
 
         Args:
           data: settled, as is what is returned.
-          control: float32 [nu], in the actuators' units.
+          control: float32 [nu], in the actuators' units; zero where ``restart``.
           restart: bool [].
           start: of the new episode.
         """
@@ -157,8 +160,8 @@ class Simulation:
             return _runge_kutta(data, self.mj_model.opt.timestep, lambda data: self._accelerate(data, restart), move)
 
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        data = data.replace(ctrl=jnp.where(restart, 0.0, control))
-        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, runge_kutta if rk4 else euler, data))
+        sub_step = runge_kutta if rk4 else euler
+        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, sub_step, data.replace(ctrl=control)))
 
     def _accelerate(self, data: mjx.Data, passive: Array) -> mjx.Data:
         """Forces, constraints and the sensors that need them; where ``passive`` without the actuators' forces."""
