@@ -1,13 +1,13 @@
 """Draws one state of a scene as MuJoCo's own renderer would, in pure JAX.
 
 First the nearest surface at four samples of each pixel, seen by the camera and by its mirror image in the floor. Then
-what these samples show, in layers of one object a pixel: two layers of what the camera sees (hardly a pixel shows three
-objects), one of the reflection. Each layer is shaded once a pixel. A pixel is the mean of sky, floor and layers,
-weighted by the samples that each covers.
+what these samples show, each shaded once a pixel: the sky, the floor and one object, the one that most samples see or,
+where none does, the one that the floor reflects. A pixel is the mean of these weighted by the samples that each covers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -43,7 +43,7 @@ def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
     if scene.floor is not None and floor is None:
         floor = _stage(floors.view(scene, camera, lights))
 
-    # Views: of the camera, and of its mirror image through the floor.
+    # Two views: of the camera, and of its mirror image through the floor.
     origins = [camera]
     far = objects.encode(solids, jnp.full((_NUM_SAMPLES, num_pixels), FAR, jnp.float32), count + 1)
     after, start = [jnp.zeros((_NUM_SAMPLES, num_pixels))], [far]
@@ -61,41 +61,28 @@ def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
     )
     number, _ = objects.decode(solids, key)
 
-    def fraction(samples: Any) -> Array:
-        """Of a pixel's samples that are set [N]."""
-        return sum(samples[i].astype(jnp.float32) for i in range(_NUM_SAMPLES)) * (1 / _NUM_SAMPLES)
-
-    def largest(samples: Any) -> Array:
-        return jnp.maximum(jnp.maximum(samples[0], samples[1]), jnp.maximum(samples[2], samples[3]))
-
-    solid = number < count
-    front = largest(jnp.where(solid[0], number[0], -1))
-    back = count - largest(jnp.where(solid[0], count - number[0], 0))
-    front_seen = fraction(number[0] == front[None])
-    floor_seen = fraction(number[0] == count)
-    layers = [(front, front_seen, 0, 1.0), (back, fraction(solid[0]) - front_seen, 0, 1.0)]
-    if len(origins) > 1:
-        assert scene.floor is not None
-        mirrored = largest(jnp.where(solid[1], number[1], -1))
-        layers.append((mirrored, fraction(solid[1]) * floor_seen, 1, scene.floor.reflectance))
-
-    color = scene.sky * fraction(number[0] > count)
+    floor_seen = _fraction([n == count for n in number[0]])
+    color = scene.sky * _fraction([n > count for n in number[0]])
     if floor is not None:
         color = color + _floor_color(scene, floor, lights, solids) * floor_seen
     if count:
-        chosen, seen, view, dim = (
-            _stage(jnp.stack([jnp.asarray(x) for x in each])) for each in zip(*layers, strict=True)
-        )
-
-        def add_layer(color: Vec, layer: tuple[Array, Array, Array, Array]) -> tuple[Vec, None]:
-            chosen, seen, view, dim = layer
-            shown = seen > 0
-            chosen = jnp.where(shown, chosen, 0)
-            own = _layer_color(scene, lights, solids, chosen, key[view], view, origin[view], dim)
-            return color + Vec.where(shown, own * seen, _BLACK), None
-
-        color, _ = jax.lax.scan(add_layer, color, (chosen, seen, view, dim))
+        color = color + _solid_color(scene, origin, lights, solids, key, floor_seen)
     return _to_bytes(color).reshape(scene.height, scene.width, 3)
+
+
+def _fraction(samples: Sequence[Array]) -> Array:
+    """Of a pixel's samples that are set [N]."""
+    return sum(jnp.asarray(sample, jnp.float32) for sample in samples) * (1 / _NUM_SAMPLES)
+
+
+def _majority(numbers: Sequence[Array], count: int) -> Array:
+    """The object that most of a pixel's samples see [N]; -1 if they see none."""
+    votes = []
+    for number in numbers:
+        same = sum((number == other).astype(jnp.int32) for other in numbers)
+        votes.append(jnp.where(number < count, same * (count + 1) + number + 1, 0))
+    most = jnp.maximum(jnp.maximum(votes[0], votes[1]), jnp.maximum(votes[2], votes[3]))
+    return most % (count + 1) - 1
 
 
 def _stage(values: Any) -> Any:
@@ -152,52 +139,54 @@ def _floor_color(scene: Scene, floor: Any, lights: list[PlacedLight], solids: li
     return color
 
 
-def _layer_color(
-    scene: Scene,
-    lights: list[PlacedLight],
-    solids: list[Solids],
-    chosen: Array,
-    key: Array,
-    view: Array,
-    origin: Vec,
-    dim: Array,
+def _solid_color(
+    scene: Scene, origin: Vec, lights: list[PlacedLight], solids: list[Solids], key: Array, floor_seen: Array
 ) -> Vec:
-    """Colour [N] of object ``chosen`` [N] in the samples [4, N] that it covers.
+    """What objects add to the pixels [N]: the colour of one of them, times what is seen of it.
 
     OpenGL shades a sample's triangle at the pixel's centre, which may lie beside that triangle, even beside the object.
-    On a round object this is where the ray through the centre meets the sample's tangent plane; there the normal,
-    which is linear along the triangle, is no longer unit.
+    On a round object this is where the ray through the centre meets the tangent plane; there the normal, which is
+    linear along the triangle, is no longer unit.
     """
-    seen = objects.surface(solids, chosen)
+    count = objects.count(solids)
     number, distance = objects.decode(solids, key)
-    center = scene.center_rays[view]
-    points, normals, besides = [], [], []
-    total = jnp.zeros_like(seen.radius)
-    for i in range(_NUM_SAMPLES):
-        covered = number[i] == chosen
-        weight = covered.astype(jnp.float32)
-        total += weight
-        direction = scene.sample_rays[view, i]
-        offset = direction * jnp.where(covered, distance[i], 1.0)  # of the point from the origin
-        point = origin + offset
-        normal, curvature = objects.normal(solids, chosen, seen, point, direction)
-        # The centre's ray meets the tangent plane this far beside the point.
-        step = center * (offset.dot(normal) / jnp.minimum(center.dot(normal), -0.1)) - offset
-        on_side = jnp.abs((point - seen.center).dot(seen.axis)) <= seen.half
-        step = step - seen.axis * jnp.where(on_side, step.dot(seen.axis), 0.0)
-        beside = normal + step * curvature
-        beside = beside * jnp.minimum(1.3 * jax.lax.rsqrt(beside.dot(beside)), 1.0)
-        points.append(offset * weight)
-        normals.append(normal * weight)
-        besides.append(beside * weight)
-    share = 1 / jnp.maximum(total, 1.0)
-    point, normal, beside = _stage(
-        (origin + Vec.sum(points) * share, Vec.sum(normals).unit(), Vec.sum(besides) * share)
-    )
-    look = (normal, (origin - point).unit(), scene.specular, scene.shininess, beside)
-    rgb = seen.rgb * dim
+    chosen = _majority(number[0], count)
+    seen = _fraction([n < count for n in number[0]])
+    rays, center, start, dim = scene.sample_rays[0], scene.center_rays[0], origin[0], 1.0
+    reflected: Any = False
+    if len(number) > 1:
+        assert scene.floor is not None
+        reflected = chosen < 0
+        chosen = jnp.where(reflected, _majority(number[1], count), chosen)
+        seen = jnp.where(reflected, _fraction([n < count for n in number[1]]) * floor_seen, seen)
+        number, distance = (jnp.where(reflected[None], a[1], a[0]) for a in (number, distance))
+        rays = Vec.where(reflected[None], scene.sample_rays[1], rays)
+        center, start = Vec.where(reflected, scene.center_rays[1], center), Vec.where(reflected, origin[1], start)
+        dim = jnp.where(reflected, scene.floor.reflectance, 1.0)
+    chosen = jnp.maximum(chosen, 0)
+    # The middle of the points that are seen of it.
+    weight = (number == chosen[None]).astype(jnp.float32)
+    weight = weight / jnp.maximum(weight.sum(0), 1.0)[None]
+    offset = Vec(*((c * distance * weight).sum(0) for c in (rays.x, rays.y, rays.z)))
+    offset, chosen, seen, center = _stage((offset, chosen, seen, center))
+
+    surface = objects.surface(solids, chosen)
+    point = start + offset
+    normal, curvature = objects.normal(solids, chosen, surface, point, offset)
+    point, normal = _stage((point, normal))
+    # From there to where the ray through the centre meets the tangent plane; along a capsule the normal stays the same.
+    offset = point - start
+    step = center * (offset.dot(normal) / jnp.minimum(center.dot(normal), -0.1)) - offset
+    on_side = jnp.abs((point - surface.center).dot(surface.axis)) <= surface.half
+    step = step - surface.axis * jnp.where(on_side, step.dot(surface.axis), 0.0)
+    beside = normal + step * curvature
+    beside = _stage(beside * jnp.minimum(1.3 * jax.lax.rsqrt(beside.dot(beside)), 1.0))
+
+    look = (normal, (start - point).unit(), scene.specular, scene.shininess, beside)
+    rgb = surface.rgb * dim
     color = _round(shading.headlight(scene.headlight, scene.backwards, *look).color(rgb))
     for placed in lights:
         own = _stage(_round(shading.scene_light(placed, point, *look).color(rgb)))
-        color = _add(color, own * jnp.where(view > 0, 1.0, _lit(scene, placed, solids, point, chosen)))
-    return color
+        lit = _lit(scene, placed, solids, point, chosen)
+        color = _add(color, own * jnp.where(reflected, 1.0, lit))
+    return Vec.where(seen > 0, color * seen, _BLACK)
