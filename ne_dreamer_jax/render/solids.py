@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ne_dreamer_jax.render import rays
 from ne_dreamer_jax.render import string as strings
@@ -45,8 +44,7 @@ class Solids(NamedTuple):
     kind: Kind
     shape: Shape  # [n]
     rgb: Vec  # [n]
-    casts: np.ndarray  # bool [n]: sites cast no shadow
-    first: int  # number of the group's first object among all
+    numbers: range  # n of them: the objects' numbers among all
 
 
 class Surface(NamedTuple):
@@ -64,23 +62,24 @@ def place(scene: Scene, data: Any, overrides: Overrides) -> list[Solids]:
     """All drawn objects of a state but the floor, numbered from 0."""
     solids, first = [], 0
     for group in scene.groups:
-        solids.append(_place_group(group, data, overrides, first))
-        first += len(group.rgba)
+        numbers = range(first, first + len(group.rgba))
+        solids.append(_place_group(group, data, overrides, numbers))
+        first = numbers.stop
     for string in scene.strings:
         shape = strings.segments(string, data.site_xpos)
         rgb = strings.color(string, data.site_xpos)
-        casts = np.ones(string.segments, bool)
-        solids.append(Solids(Kind.ROUND, shape, Vec(*(jnp.full_like(shape.center.x, c) for c in rgb)), casts, first))
-        first += string.segments
+        numbers = range(first, first + string.segments)
+        solids.append(Solids(Kind.ROUND, shape, Vec(*(jnp.full_like(shape.center.x, c) for c in rgb)), numbers))
+        first = numbers.stop
     return solids
 
 
 def count(solids: list[Solids]) -> int:
     """How many objects there are."""
-    return sum(len(group.casts) for group in solids)
+    return sum(len(group.numbers) for group in solids)
 
 
-def _place_group(group: Group, data: Any, overrides: Overrides, first: int) -> Solids:
+def _place_group(group: Group, data: Any, overrides: Overrides, numbers: range) -> Solids:
     split = len(group.geoms)
 
     def select(geom: Any, site: Any, geom_default: Any = None, site_default: Any = None) -> Array:
@@ -102,8 +101,7 @@ def _place_group(group: Group, data: Any, overrides: Overrides, first: int) -> S
         kind=group.kind,
         shape=Shape(position, Vec.of(frame[:, :, 0]), Vec.of(frame[:, :, 1]), Vec.of(frame[:, :, 2]), Vec.of(size)),
         rgb=Vec.of(rgba),
-        casts=np.arange(len(group.rgba)) < split,
-        first=first,
+        numbers=numbers,
     )
 
 
@@ -137,28 +135,23 @@ def nearest(solids: list[Solids], origin: Vec, direction: Vec, after: Array, key
             t = intersect(shape, origin, direction)
             return jnp.minimum(key, encode(solids, jnp.where(t > after, t, MISS), number)), None
 
-        numbers = jnp.arange(len(group.casts), dtype=jnp.int32) + group.first
-        key, _ = jax.lax.scan(nearer, key, (group.shape, numbers))
+        key, _ = jax.lax.scan(nearer, key, (group.shape, jnp.asarray(group.numbers, jnp.int32)))
     return key
 
 
 def blocked(solids: list[Solids], origin: Vec, direction: Vec, end: float, number: Array) -> Array:
-    """Whether an object other than ``number`` (that casts shadows) lies on a ray before distance ``end``."""
+    """Whether an object other than ``number`` [N] lies on a ray before distance ``end``."""
     result = jnp.zeros(number.shape, bool)
     for group in solids:
         intersect = _INTERSECT[group.kind]
-        casters = np.flatnonzero(group.casts)
-        if not casters.size:
-            continue
 
         def block(
             result: Array, item: tuple[Shape, Array], intersect: Callable[..., Array] = intersect
         ) -> tuple[Array, None]:
-            shape, caster = item
-            return result | ((intersect(shape, origin, direction) < end) & (caster != number)), None
+            shape, other = item
+            return result | ((intersect(shape, origin, direction) < end) & (other != number)), None
 
-        casting = jax.tree.map(lambda a, casters=casters: a[casters], group.shape)
-        result, _ = jax.lax.scan(block, result, (casting, jnp.asarray(casters + group.first, jnp.int32)))
+        result, _ = jax.lax.scan(block, result, (group.shape, jnp.asarray(group.numbers, jnp.int32)))
     return result
 
 
@@ -194,9 +187,9 @@ def normal(solids: list[Solids], number: Array, seen: Surface, point: Vec, direc
     for group in solids:
         if group.kind not in _SPECIAL:
             continue
-        for i in range(len(group.casts)):
+        for i, own in enumerate(group.numbers):
             shape = jax.tree.map(lambda a, i=i: a[i], group.shape)
-            mine = number == group.first + i
+            mine = number == own
             result = Vec.where(mine, _special_normal(group.kind, shape, point), result)
             curvature = jnp.where(mine, 0.0, curvature)
     return result, curvature
