@@ -152,9 +152,12 @@ def _solid_color(
     number, distance = objects.decode(solids, key)
     chosen = _majority(number[0], count)
     seen = _fraction([n < count for n in number[0]])
-    rays, center, start, dim = scene.sample_rays[0], scene.center_rays[0], origin[0], 1.0
+    rays, center, start = scene.sample_rays[0], scene.center_rays[0], origin[0]
+    dim: Any = 1.0
     reflected: Any = False
-    if len(number) > 1:
+    if len(number) == 1:
+        number, distance = number[0], distance[0]
+    else:
         assert scene.floor is not None
         reflected = chosen < 0
         chosen = jnp.where(reflected, _majority(number[1], count), chosen)
