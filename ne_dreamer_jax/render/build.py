@@ -57,6 +57,15 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         return axes @ np.stack([right.ravel(), up.ravel(), -np.ones(height * width)])
 
     center = rays(0.5, 0.5)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ground = None if floor_id is None else _floor(model, data, floor_id)
+    views = [np.eye(3)]
+    if ground is not None and ground.reflectance > 0:
+        normal = np.array([ground.normal.x, ground.normal.y, ground.normal.z])
+        views.append(np.eye(3) - 2 * np.outer(normal, normal))
+    center_rays = np.stack([view @ center for view in views], 1)
+    sample_rays = np.stack([np.stack([view @ rays(x, y) for x, y in SAMPLES], 1) for view in views], 1)
     groups = _groups(model, floor_id)
     specular, shininess = _common_material(model, groups)
     scene = Scene(
@@ -66,8 +75,8 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         right=_floats(axes[:, 0]),
         up=_floats(axes[:, 1]),
         backwards=_floats(axes[:, 2]),
-        center_rays=Vec(*center.astype(np.float32)),
-        sample_rays=Vec(*np.stack([rays(x, y) for x, y in SAMPLES], 1).astype(np.float32)),
+        center_rays=Vec(*center_rays.astype(np.float32)),
+        sample_rays=Vec(*sample_rays.astype(np.float32)),
         pixel_size=pixel_size,
         sky=Vec(*texture.skybox(model, center, axes[:, 0] * pixel_size, -axes[:, 1] * pixel_size).astype(np.float32)),
         groups=groups,
@@ -78,13 +87,11 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
         lights=tuple(_light(model, i) for i in range(model.nlight) if model.light_active[i]),
         shadow_clip=float(model.stat.extent * model.vis.map.shadowclip),
         shadow_scale=float(model.vis.map.shadowscale),
-        floor=None if floor_id is None else _floor(model, floor_id),
+        floor=ground,
     )
     stands_still = model.cam_mode[camera_id] == _FIXED and not any(light.body for light in scene.lights)
     if scene.floor is None or not stands_still:
         return scene
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
     with jax.ensure_compile_time_eval():
         view = floor.view(scene, camera.camera_position(scene, data), camera.place_lights(scene, data))
     return dataclasses.replace(scene, floor_view=jax.tree.map(np.asarray, view))
@@ -112,9 +119,14 @@ def _drawn(model: mujoco.MjModel, what: str) -> list[int]:
 
 def _floor_id(model: mujoco.MjModel) -> int | None:
     """The first textured or reflective plane, or else the first plane."""
-    planes = [i for i in _drawn(model, "geom") if model.geom_type[i] == _PLANE and model.geom_bodyid[i] == 0]
+    planes = [i for i in _drawn(model, "geom") if model.geom_type[i] == _PLANE and _stands(model, model.geom_bodyid[i])]
     special = [i for i in planes if _is_special(model, int(model.geom_matid[i]))]
     return next(iter(special + planes), None)
+
+
+def _stands(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a body never moves."""
+    return bool(model.body_weldid[body] == 0 and model.body_mocapid[body] < 0)
 
 
 def _is_special(model: mujoco.MjModel, material: int) -> bool:
@@ -192,15 +204,13 @@ def _string(model: mujoco.MjModel, tendon: int) -> String:
     )
 
 
-def _floor(model: mujoco.MjModel, floor_id: int) -> Floor:
+def _floor(model: mujoco.MjModel, data: mujoco.MjData, floor_id: int) -> Floor:
     material = int(model.geom_matid[floor_id])
     rgba, specular, shininess = _material(model, material, model.geom_rgba[floor_id])
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, model.geom_quat[floor_id])
-    x, y, normal = axes.reshape(3, 3).T
+    x, y, normal = data.geom_xmat[floor_id].reshape(3, 3).T
     size = model.geom_size[floor_id]
     return Floor(
-        center=_floats(model.geom_pos[floor_id]),
+        center=_floats(data.geom_xpos[floor_id]),
         x=_floats(x),
         y=_floats(y),
         normal=_floats(normal),
@@ -251,7 +261,7 @@ def _refuse_unsupported(model: mujoco.MjModel, camera_id: int, floor_id: int | N
         raise ValueError(f"{what} can't be drawn: {why}")
 
     def keeps_direction(mode: int, body: int) -> bool:
-        return mode in (_TRACK, _TRACKCOM) or (mode == _FIXED and model.body_weldid[body] == 0)
+        return mode in (_TRACK, _TRACKCOM) or (mode == _FIXED and _stands(model, body))
 
     seen = f"camera {model.camera(camera_id).name!r}"
     if not keeps_direction(model.cam_mode[camera_id], model.cam_bodyid[camera_id]):
@@ -277,7 +287,7 @@ def _refuse_unsupported(model: mujoco.MjModel, camera_id: int, floor_id: int | N
             if _is_special(model, material) and not (what == "geom" and i == floor_id):
                 reflects = shape in (_BOX, _PLANE) and model.mat_reflectance[material] > 0
                 if reflects or (model.mat_texid[material] >= 0).any():
-                    refuse(name, "it is textured or reflects; only one plane of the world body, the floor, may")
+                    refuse(name, "it is textured or reflects; only one plane that stands still, the floor, may")
     for i in _drawn_tendons(model):
         path = model.wrap_type[model.tendon_adr[i] :][: model.tendon_num[i]]
         hangs = model.tendon_limited[i] and model.tendon_range[i][0] == 0 and model.tendon_stiffness[i] == 0

@@ -19,12 +19,12 @@ def view(scene: Scene, camera: Vec, lights: list[PlacedLight]) -> FloorView:
     floor = scene.floor
     assert floor is not None
     shape = Shape(floor.center, floor.x, floor.y, floor.normal, Vec(*floor.size))
-    sample_distance = rays.plane(shape, camera, scene.sample_rays)
+    samples, center = scene.sample_rays[0], scene.center_rays[0]
+    sample_distance = rays.plane(shape, camera, samples)
     # Where the floor ends within a pixel it is looked at in the middle of what is seen of it.
     seen = (sample_distance < MISS).astype(jnp.float32)
     count = seen.sum(0)
     weight = seen / jnp.maximum(count, 1.0)[None]
-    samples, center = scene.sample_rays, scene.center_rays
     middle = Vec((samples.x * weight).sum(0), (samples.y * weight).sum(0), (samples.z * weight).sum(0))
     direction = Vec.where((count > 0) & (count < 4), middle, center)
     offset = camera - floor.center
@@ -37,12 +37,7 @@ def view(scene: Scene, camera: Vec, lights: list[PlacedLight]) -> FloorView:
     return FloorView(sample_distance, direction, distance, point, headlight, tuple(rest))
 
 
-def mirror(floor: Floor, direction: Vec) -> Vec:
-    """Directions mirrored in the floor."""
-    return direction - floor.normal * (2 * direction.dot(floor.normal))
-
-
-def mirror_point(floor: Floor, point: Vec) -> Vec:
+def mirror(floor: Floor, point: Vec) -> Vec:
     """A point mirrored in the floor."""
     return point - floor.normal * (2 * (point - floor.center).dot(floor.normal))
 

@@ -9,6 +9,9 @@ A ray that starts inside a shape, or only leaves it, misses it.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -42,6 +45,9 @@ class Vec:
     def __neg__(self) -> Vec:
         return Vec(-self.x, -self.y, -self.z)
 
+    def __getitem__(self, index: Any) -> Vec:
+        return Vec(*(jnp.asarray(c)[index] for c in (self.x, self.y, self.z)))
+
     def dot(self, other: Vec) -> Any:
         return self.x * other.x + self.y * other.y + self.z * other.z
 
@@ -59,6 +65,11 @@ class Vec:
     def of(array: Any) -> Vec:
         """From an array whose last axis has length 3."""
         return Vec(array[..., 0], array[..., 1], array[..., 2])
+
+    @staticmethod
+    def sum(vectors: Iterable[Vec]) -> Vec:
+        first, *rest = vectors
+        return functools.reduce(operator.add, rest, first)
 
     @staticmethod
     def where(condition: Any, yes: Vec, no: Vec) -> Vec:
@@ -86,12 +97,6 @@ def away_from_zero(value: Any) -> Any:
 
 def capsule(shape: Shape, origin: Vec, direction: Vec) -> Array:
     """Capsule along the shape's z axis: ``size.x`` radius, ``size.y`` half length. Half length 0 is a sphere."""
-    t, hit = capsule_approach(shape, origin, direction)
-    return jnp.where(hit, t, MISS)
-
-
-def capsule_approach(shape: Shape, origin: Vec, direction: Vec) -> tuple[Array, Array]:
-    """Distance at which a ray enters a capsule, or comes nearest to its axis where it misses, and whether it hits."""
     axis, radius, half = shape.z, shape.size.x, shape.size.y
     offset = origin - shape.center
     # The infinite cylinder. Cross products keep float32 precise where the ray's origin is hundreds of radii away.
@@ -111,7 +116,8 @@ def capsule_approach(shape: Shape, origin: Vec, direction: Vec) -> tuple[Array, 
     t_end = (end * slope - facing - jnp.sqrt(jnp.maximum(discriminant_end, 0.0))) / length2
     on_side = jnp.abs(reach) <= half
     t = jnp.where(on_side, t_side, t_end)
-    return t, (discriminant > 0) & (on_side | (discriminant_end > 0)) & (t > 0)
+    hit = (discriminant > 0) & (on_side | (discriminant_end > 0)) & (t > 0)
+    return jnp.where(hit, t, MISS)
 
 
 def cylinder(shape: Shape, origin: Vec, direction: Vec) -> Array:

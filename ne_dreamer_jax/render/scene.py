@@ -110,7 +110,10 @@ class Floor:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything about a task's pictures that no state changes. N = height * width pixels, 4 samples each."""
+    """Everything about a task's pictures that no state changes.
+
+    N = height * width pixels, 4 samples each. V views: the camera's, and its mirror image's in a floor that reflects.
+    """
 
     height: int
     width: int
@@ -118,8 +121,8 @@ class Scene:
     right: Vec  # of floats; the camera's axes in the world frame, which no state changes
     up: Vec
     backwards: Vec
-    center_rays: Vec  # float32 [N], world directions through the pixels' centres
-    sample_rays: Vec  # float32 [4, N], through their samples
+    center_rays: Vec  # float32 [V, N], world directions through the pixels' centres
+    sample_rays: Vec  # float32 [V, 4, N], through their samples
     pixel_size: float  # of the image plane at distance 1
     sky: Vec  # float32 [N], in [0, 1]
     groups: tuple[Group, ...]

@@ -50,11 +50,12 @@ def _reflect(
     attenuation: Any = 1.0,
     beside: Vec | None = None,
 ) -> Reflected:
-    """Blinn's model with all vectors unit: diffuse N.L, specular (N.H)^shininess where N.L > 0."""
+    """Blinn's model with all vectors unit: diffuse N.L, specular (N.H)^shininess where N.L > 0.
+
+    ``beside`` stands for the normal in the diffuse term, see ``layers``.
+    """
     facing = normal.dot(to_light)
-    diffuse = jnp.maximum(facing, 0.0)
-    if beside is not None:
-        diffuse = jnp.where(facing > 0, beside.dot(to_light), 0.0)
+    diffuse = jnp.where(facing > 0, (beside or normal).dot(to_light), 0.0)
     half = (to_light + to_camera).unit()
     # Below 0.3 the power of any shininess in use is nothing; the floor keeps its squarings out of denormal numbers.
     shine = power(jnp.maximum(normal.dot(half), 0.3), shininess) * specular * strength.specular
