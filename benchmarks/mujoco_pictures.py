@@ -99,7 +99,9 @@ def load(path: pathlib.Path, domain: str) -> Pictures:
     for name, value in original.items():
         getattr(model, name)[:] = value
     stacked = {name: np.stack([pose[name] for pose in poses]) for name in _POSE}
-    sizes = {name: arrays[name] for name in ("geom_size", "site_size", "site_rgba") if name in arrays}
+    sizes: dict[str, np.ndarray] = {
+        name: arrays[name] for name in ("geom_size", "site_size", "site_rgba") if name in arrays
+    }
     return Pictures(model, _CAMERAS.get(domain, 0), stacked, sizes, arrays["image"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pathlib
 import subprocess
@@ -69,9 +70,9 @@ def main(
                 "mae": float(np.abs(drawn.astype(float) - loaded.images).mean()),
                 "ssim": float(np.mean([similarity(a, b) for a, b in zip(drawn, loaded.images, strict=True)])),
             }
-            cases[domain] = lambda draw=draw, chunk=chunks[0]: draw(*chunk)
+            cases[domain] = functools.partial(draw, *chunks[0])
             if ask is not None:
-                cases[f"{domain} osmesa"] = lambda domain=domain, ask=ask: ask(domain, frames)
+                cases[f"{domain} osmesa"] = functools.partial(ask, domain, frames)
             if pictures is not None:
                 _store(pictures / f"{domain}.png", drawn, loaded.images)
         measured = common.measure(cases, rounds=rounds)

@@ -72,11 +72,11 @@ def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
 
 def _fraction(samples: Sequence[Array]) -> Array:
     """Of a pixel's samples that are set [N]."""
-    return sum(jnp.asarray(sample, jnp.float32) for sample in samples) * (1 / _NUM_SAMPLES)
+    return jnp.stack(samples).astype(jnp.float32).mean(0)
 
 
-def _majority(numbers: Sequence[Array], count: int) -> Array:
-    """The object that most of a pixel's samples see [N]; -1 if they see none."""
+def _majority(numbers: Array, count: int) -> Array:
+    """The object that most of a pixel's samples, numbers [samples, N], see [N]; -1 if they see none."""
     votes = []
     for number in numbers:
         same = sum((number == other).astype(jnp.int32) for other in numbers)
