@@ -31,7 +31,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
         f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
         f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
         f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
-        f"{options.prefill:,} agent steps; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
+        f"{loop.prefill:,} agent steps; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
         f"  memory    replay holds {loop.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]

@@ -100,6 +100,8 @@ class Loop(NamedTuple):
     """Vector steps of one chunk: as configured, but no more than about `CHUNK_UPDATES` updates."""
     vector_steps: int
     """Vector steps of the whole run."""
+    prefill: int
+    """Transitions that are collected before the first update."""
     updates: int
     """Updates of the whole run."""
 
@@ -256,6 +258,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         capacity=capacity,
         chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // max(wage, 1))),
         vector_steps=vector_steps,
+        prefill=prefill * n,
         updates=updates,
     )
 

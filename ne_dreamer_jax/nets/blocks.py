@@ -36,10 +36,7 @@ def rms_norm(x: Array, scale: Array) -> Array:
 
 
 class Linear(nn.Module):
-    """Affine map of the concatenation of its inputs ``[..., I_k]`` to ``[..., units]``.
-
-    Several inputs are multiplied by their own rows of the kernel, which spares writing out the concatenation.
-    """
+    """Affine map ``[..., I]`` to ``[..., units]``."""
 
     units: int
     use_bias: bool = True
@@ -47,19 +44,13 @@ class Linear(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, *inputs: Array) -> Array:
-        rows = sum(x.shape[-1] for x in inputs)
-        kernel = self.param("kernel", kernel_init(self.scale), (rows, self.units), jnp.float32).astype(self.dtype)
-        start, total = 0, None
-        for x in inputs:
-            product = x.astype(self.dtype) @ kernel[start : start + x.shape[-1]]
-            total = product if total is None else total + product
-            start += x.shape[-1]
-        assert total is not None
-        if self.use_bias:
-            bias = self.param("bias", initializers.zeros_init(), (self.units,), jnp.float32).astype(self.dtype)
-            total = total + jnp.expand_dims(bias, range(total.ndim - 1))
-        return total
+    def __call__(self, x: Array) -> Array:
+        kernel = self.param("kernel", kernel_init(self.scale), (x.shape[-1], self.units), jnp.float32)
+        product = x.astype(self.dtype) @ kernel.astype(self.dtype)
+        if not self.use_bias:
+            return product
+        bias = self.param("bias", initializers.zeros_init(), (self.units,), jnp.float32).astype(self.dtype)
+        return product + jnp.expand_dims(bias, range(product.ndim - 1))
 
 
 class RMSNorm(nn.Module):
@@ -71,26 +62,25 @@ class RMSNorm(nn.Module):
 
 
 class Block(nn.Module):
-    """Linear, RMSNorm, SiLU: ``[..., I_k]`` to ``[..., units]``."""
+    """Linear, RMSNorm, SiLU: ``[..., I]`` to ``[..., units]``."""
 
     units: int
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, *inputs: Array) -> Array:
-        return nn.silu(RMSNorm(name="norm")(Linear(self.units, dtype=self.dtype, name="linear")(*inputs)))
+    def __call__(self, x: Array) -> Array:
+        return nn.silu(RMSNorm(name="norm")(Linear(self.units, dtype=self.dtype, name="linear")(x)))
 
 
 class MLP(nn.Module):
-    """``layers`` blocks of ``units``; the first takes the concatenation of the inputs."""
+    """``layers`` blocks of ``units``."""
 
     layers: int
     units: int
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, *inputs: Array) -> Array:
+    def __call__(self, x: Array) -> Array:
         for i in range(self.layers):
-            inputs = (Block(self.units, self.dtype, name=f"block{i}")(*inputs),)
-        (x,) = inputs
+            x = Block(self.units, self.dtype, name=f"block{i}")(x)
         return x

@@ -70,6 +70,7 @@ def build(config, *, image: bool = True) -> training.Run:
         capacity=total * n,
         chunk_steps=config.loop.chunk_steps,
         vector_steps=total,
+        prefill=prefill * n,
         updates=total - prefill,
     )
     return training.Run(config, agent, loop, jax.eval_shape(init, jax.random.key(0)))  # type: ignore[arg-type]
