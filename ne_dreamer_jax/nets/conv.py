@@ -2,8 +2,7 @@
 
 On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
 on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
-matrix products over a few images at a time. The platform is the one that JAX would place new arrays on when the
-function is traced; a wrong guess (a program traced for another device than the default) costs speed, never correctness.
+matrix products over a few images at a time.
 
 On several CPU devices wrap the call in `jax.shard_map` over the images: the loop over chunks of a global array would
 otherwise run whole on every device.
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 from ne_dreamer_jax.nets import cpu_conv
 from ne_dreamer_jax.nets.blocks import rms_norm
 from ne_dreamer_jax.nets.cpu_conv import Stage as Stage
+from ne_dreamer_jax.nets.platform import on_cpu
 from ne_dreamer_jax.types import Array
 
 
@@ -34,7 +34,7 @@ def conv2d(x: Array, kernel: Array) -> Array:
             f"Expected x [N, H, W, C_in] and kernel [k, k, C_in, C_out] of one dtype, got {x.dtype} {list(x.shape)} "
             f"and {kernel.dtype} {list(kernel.shape)}."
         )
-    if _on_cpu() and x.dtype == jnp.float32:
+    if on_cpu() and x.dtype == jnp.float32:
         return cpu_conv.conv2d(x, kernel)
     return lax_conv2d(x, kernel)
 
@@ -59,7 +59,7 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
             f"Expected images [N, H, W, C] with H and W multiples of {factor}, for {len(stages)} stages that halve "
             f"them, got {list(images.shape)}. Resize the images or use fewer stages."
         )
-    if _on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
+    if on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
         return cpu_conv.encode_images(images, stages)
     return lax_encode_images(images, stages, dtype)
 
@@ -71,14 +71,6 @@ def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.f
         x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
         x = jax.nn.silu(rms_norm(x, stage.scale))
     return x
-
-
-def _on_cpu() -> bool:
-    # A device, the name of a platform, or None.
-    device = jax.config.jax_default_device  # type: ignore[attr-defined]
-    if device is None:
-        return jax.default_backend() == "cpu"
-    return getattr(device, "platform", device) == "cpu"
 
 
 def _pool(x: Array) -> Array:

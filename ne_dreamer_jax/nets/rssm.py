@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax.linen import initializers
 
 from ne_dreamer_jax.losses import unimix_logits
-from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, kernel_init
+from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init
 from ne_dreamer_jax.types import Array, Latent
 
 
@@ -134,10 +134,10 @@ class RSSM(nn.Module):
         flat = latent.stoch.reshape(latent.stoch.shape[0], -1)
         inputs = jnp.concatenate([self.deter_in(latent.deter), self.stoch_in(flat), action_in], axis=-1)
         state = latent.deter.reshape(-1, c.blocks, c.deter // c.blocks)
-        own = jnp.einsum("ngi,gio->ngo", state.astype(dtype), self.state_kernel.astype(dtype))
+        own = block_linear(state.astype(dtype), self.state_kernel.astype(dtype))
         x = own.reshape(-1, c.deter) + inputs @ self.input_kernel.astype(dtype) + self.hidden_bias.astype(dtype)[None]
         x = nn.silu(self.hidden_norm(x)).reshape(state.shape)
-        gates = jnp.einsum("ngi,gio->ngo", x, self.gate_kernel.astype(dtype)) + self.gate_bias.astype(dtype)[None]
+        gates = block_linear(x, self.gate_kernel.astype(dtype)) + self.gate_bias.astype(dtype)[None]
         reset, candidate, update = jnp.split(gates.astype(jnp.float32), 3, axis=-1)
         candidate = jnp.tanh(nn.sigmoid(reset) * candidate)
         update = nn.sigmoid(update - 1)
