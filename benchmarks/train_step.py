@@ -78,12 +78,12 @@ def configure(size: str, method: str, assignments: tuple[str, ...]) -> Any:
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:
     """Name -> the part with its gradients, compiled, on inputs of its own."""
     from ne_dreamer_jax import behavior, optim, world_model
+    from ne_dreamer_jax.agent import world_model_of
     from ne_dreamer_jax.nets.networks import Networks
     from ne_dreamer_jax.nets.rssm import feature, observe
-    from ne_dreamer_jax.objectives import Sizes
 
     nets = Networks.build(spec, config.encoder, config.rssm, config.heads, jnp.dtype(config.compute_dtype))
-    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, config.batch_length, nets.dtype))
+    objective = config.objective.build(world_model_of(nets, config.batch_length))
     key = jax.random.key(2)
     params = jax.tree.map(jnp.copy, state.params)  # the update donates the others
     slow, target, scale = jax.tree.map(jnp.copy, (state.slow_critic, state.target, state.return_scale))

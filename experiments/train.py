@@ -142,9 +142,9 @@ def configure(
         config = presets.with_method(config, method)
     for path, value in values.items():
         if value is not None:
-            config = settings.override(config, f"{path}={value}")
+            config = presets.override(config, f"{path}={value}")
     for assignment in assignments:
-        config = settings.override(config, assignment)
+        config = presets.override(config, assignment)
     return config
 
 

@@ -17,7 +17,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
-from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding, Sizes
+from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import (
     Array,
@@ -65,6 +65,11 @@ class AgentConfig:
     compute_dtype: str = "float32"
     """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32."""
 
+    @property
+    def method(self) -> str:
+        """Name of the method that these settings are."""
+        return self.objective.method
+
 
 class Agent(NamedTuple):
     """Pure functions. N environments act together; a batch has B sequences of T steps."""
@@ -91,7 +96,7 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     """
     dtype = _compute_dtype(config.compute_dtype)
     nets = Networks.build(spec, config.encoder, config.rssm, config.heads, dtype)
-    objective = config.objective.build(Sizes(spec, nets.feature, nets.embedding, config.batch_length, dtype))
+    objective = config.objective.build(world_model_of(nets, config.batch_length))
     optimizer = optim.make(config.optimizer)
     _check_loss_scales(config)
 
@@ -173,6 +178,12 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         config=config,
         spec=spec,
     )
+
+
+def world_model_of(nets: Networks, length: int) -> Model:
+    """What objectives are built for: networks, and sequences of ``length`` steps."""
+    unroll = lambda params, key, batch: world_model.posterior_rollout(nets, params, key, batch)[0]
+    return Model(nets, length, unroll)
 
 
 def parameter_counts(params: Params) -> dict[str, int]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from ne_dreamer_jax import objectives
+from ne_dreamer_jax import settings
 from ne_dreamer_jax.agent import AgentConfig
 from ne_dreamer_jax.behavior import BehaviorConfig
 from ne_dreamer_jax.loop import LoopConfig
@@ -18,6 +18,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
+from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.settings import did_you_mean
 
@@ -53,8 +54,12 @@ class Config:
     env: EnvConfig = field(default_factory=EnvConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
-    method: str = "ne_dreamer"
     seed: int = 0
+
+    @property
+    def method(self) -> str:
+        """Name of the method, read off the agent's settings, so that it can't say anything else."""
+        return self.agent.method
 
 
 def _check(kind: str, name: str, known: Iterable[str]) -> None:
@@ -88,7 +93,7 @@ def quickstart(size: str) -> Config:
     agent = replace(
         base,
         heads=replace(base.heads, bins=63),
-        objective=replace(base.objective, predictor=PredictorConfig(layers=1, width=128, feedforward=256)),
+        objective=NextEmbedding(PredictorConfig(layers=1, width=128, feedforward=256)),
         behavior=BehaviorConfig(horizon=10, discount=0.98),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
         batch_size=16,
@@ -120,20 +125,40 @@ def preset(name: str, size: str | None = None) -> Config:
 
 
 def with_method(config: Config, method: str) -> Config:
-    """The config with another of the paper's methods; what the methods share stays as the config has it."""
+    """The config with another of the paper's methods; what the methods share stays as the config has it.
+
+    The weights of the method's own losses are its authors', unless the config weighs losses of these names already.
+    """
     _check("method", method, METHODS)
-    agent = replace(config.agent, objective=METHODS[method](config.agent.objective))
-    return replace(config, agent=agent, method=method)
+    return _with_objective(config, METHODS[method](config.agent.objective))
 
 
-def _with_predictor(objective: objectives.NextEmbedding, **changes: Any) -> objectives.NextEmbedding:
-    return replace(objective, predictor=replace(objective.predictor, **changes))
+def override(config: Config, assignment: str) -> Config:
+    """`settings.override`; another objective (``agent.objective=SameStep``) brings the weights of its losses along."""
+    changed = settings.override(config, assignment)
+    other = type(changed.agent.objective) is not type(config.agent.objective)
+    return _with_objective(config, changed.agent.objective) if other else changed
 
 
-METHODS: dict[str, Callable[[Any], Any]] = {
-    "ne_dreamer": lambda objective: objective,
-    "ne_dreamer/no_transformer": lambda objective: _with_predictor(objective, layers=0),
-    "ne_dreamer/no_shift": lambda objective: replace(objective, shift=0),
-    "ne_dreamer/no_projector": lambda objective: _with_predictor(objective, projector=False),
+def _with_objective(config: Config, objective: AnyObjective) -> Config:
+    old, new = config.agent.objective.losses, objective.losses
+    kept = {name: scale for name, scale in config.agent.loss_scales.items() if name not in old or name in new}
+    return replace(config, agent=replace(config.agent, objective=objective, loss_scales={**new, **kept}))
+
+
+def _next_embedding(objective: AnyObjective, **predictor: Any) -> NextEmbedding:
+    """The full method's objective, of the given one's sizes where it is of this kind."""
+    full = objective if isinstance(objective, NextEmbedding) else NextEmbedding()
+    return replace(full, predictor=replace(full.predictor, **predictor))
+
+
+METHODS: dict[str, Callable[[AnyObjective], AnyObjective]] = {
+    "ne_dreamer": _next_embedding,
+    "ne_dreamer/no_transformer": lambda objective: _next_embedding(objective, layers=0),
+    "ne_dreamer/no_shift": lambda objective: replace(_next_embedding(objective), shift=0),
+    "ne_dreamer/no_projector": lambda objective: _next_embedding(objective, projector=False),
+    "dreamerv3": lambda objective: Reconstruction(),
+    "r2dreamer": lambda objective: SameStep(),
+    "dreamer_no_reconstruction": lambda objective: NoObjective(),
 }
-"""Method -> its objective, made from the full method's."""
+"""Method -> its objective, made from that of a config."""

@@ -3,7 +3,15 @@
 ``config`` gives them their meaning; a test keeps the two equal.
 """
 
-METHODS = ("ne_dreamer", "ne_dreamer/no_transformer", "ne_dreamer/no_shift", "ne_dreamer/no_projector")
+METHODS = (
+    "ne_dreamer",
+    "ne_dreamer/no_transformer",
+    "ne_dreamer/no_shift",
+    "ne_dreamer/no_projector",
+    "dreamerv3",
+    "r2dreamer",
+    "dreamer_no_reconstruction",
+)
 PRESETS = ("dmc", "quickstart", "smoke")
 SIZES = ("1m", "12m", "25m", "50m", "100m", "200m", "400m")
 OBSERVATIONS = ("pixels", "vector", "both")

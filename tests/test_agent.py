@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import make_agent, replay
 from ne_dreamer_jax.agent import parameter_counts
-from ne_dreamer_jax.config import agent_config
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
 from ne_dreamer_jax.world_model import WorldModelConfig
 from tests import tiny
@@ -25,20 +25,24 @@ def shapes(config, spec):
     return jax.eval_shape(make_agent(config, spec).init, jax.random.key(0))
 
 
-def test_parameter_counts_are_those_of_the_authors_code():
-    """At 12m with 64x64 images and 6 continuous actions; the predictor's 2,239,232 and the projector's 2,621,440."""
+SHARED = {"rssm": 5_979_648, "actor": 791_052, "critic": 853_503, "reward": 721_407, "continue": 656_129}
+OWN = {  # method -> the objective's trained parameters, and those of its target
+    "ne_dreamer": (2_621_440 + 2_239_232, 0),  # projector and predictor
+    "dreamerv3": (1_272_003, 0),  # decoder
+    "r2dreamer": (2_621_440, 0),  # projector
+    "dreamer_no_reconstruction": (0, 0),
+}
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_parameter_counts_are_those_of_the_authors_code(method):
+    """At 12m with 64x64 images and 6 continuous actions; only the chosen objective's own parameters exist."""
     spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(6))
-    params = shapes(agent_config("12m"), spec).params
-    assert parameter_counts(params) == {
-        "rssm": 5_979_648,
-        "actor": 791_052,
-        "critic": 853_503,
-        "reward": 721_407,
-        "continue": 656_129,
-        "encoder": 220_416,
-        "objective": 2_621_440 + 2_239_232,
-    }
-    assert params["objective"]["projector"]["kernel"].size == 2_621_440
+    state = shapes(configs.with_method(configs.preset("dmc", "12m"), method).agent, spec)
+    own, target = OWN[method]
+    assert parameter_counts(state.params) == {**SHARED, "encoder": 220_416, "objective": own}
+    assert sum(x.size for x in jax.tree.leaves(state.target)) == target
+    assert set(OWN) == {name for name in configs.METHODS if "/" not in name}
 
 
 def test_a_fresh_state_is_float32_and_starts_at_zero():

@@ -2,6 +2,7 @@
 
 import json
 import typing
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,13 @@ import pytest
 from experiments.schedule import Schedule
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax import make_agent, names, optim, replay, settings, world_model
+from ne_dreamer_jax import make_agent, names, objectives, optim, replay, settings, world_model
 from ne_dreamer_jax.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.behavior import actor_critic_losses
 from ne_dreamer_jax.config import Config, EnvConfig
 from ne_dreamer_jax.loop import LoopConfig
-from ne_dreamer_jax.objectives import NextEmbedding
-from ne_dreamer_jax.types import ReturnScale, Rollout
+from ne_dreamer_jax.objectives import NextEmbedding, NoObjective, Reconstruction, SameStep
+from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout
 from tests import counting, tiny
 from tests.tiny import program
 
@@ -41,20 +42,65 @@ def test_presets_build_at_every_size_and_survive_json(name):
     make_agent(configs.preset(name).agent, tiny.VECTORS)
 
 
-@pytest.mark.parametrize("method", names.METHODS)
-def test_methods_are_values_of_the_objective(method):
+ABLATIONS = [name for name in names.METHODS if name.startswith("ne_dreamer")]
+
+
+@pytest.mark.parametrize("method", ABLATIONS)
+def test_ablations_are_values_of_the_objective(method):
     base = configs.preset("dmc")
     config = configs.with_method(base, method)
-    assert config.method == method
-    assert settings.from_dict(Config, json.loads(json.dumps(settings.to_dict(config)))) == config
     changed = {path for path, value in settings.paths(config).items() if value != settings.paths(base)[path]}
     ablation = {
         "ne_dreamer": set(),
-        "ne_dreamer/no_transformer": {"method", "agent.objective.predictor.layers"},
-        "ne_dreamer/no_shift": {"method", "agent.objective.shift"},
-        "ne_dreamer/no_projector": {"method", "agent.objective.predictor.projector"},
+        "ne_dreamer/no_transformer": {"agent.objective.predictor.layers"},
+        "ne_dreamer/no_shift": {"agent.objective.shift"},
+        "ne_dreamer/no_projector": {"agent.objective.predictor.projector"},
     }
     assert changed == ablation[method]
+
+
+@pytest.mark.parametrize("method", names.METHODS)
+def test_methods_differ_in_the_objective_and_the_weights_of_its_losses(method):
+    base = configs.preset("dmc")
+    config = configs.with_method(base, method)
+    assert config.method == method
+    stored = json.loads(json.dumps(settings.to_dict(config)))
+    assert stored["agent"]["objective"]["type"] == type(config.agent.objective).__name__
+    assert settings.from_dict(Config, stored) == config
+    assert config.agent.loss_scales == {**BASE_LOSS_SCALES, **config.agent.objective.losses}
+    assert replace(config.agent, objective=None, loss_scales={}) == replace(base.agent, objective=None, loss_scales={})
+    for other in names.METHODS:  # by whatever way
+        assert (
+            configs.with_method(configs.with_method(base, other), method).agent.loss_scales == config.agent.loss_scales
+        )
+    make_agent(config.agent, EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(2)))
+
+
+def test_weights_of_losses_that_a_method_shares_are_kept():
+    weighed = configs.override(configs.preset("dmc"), "agent.loss_scales.next_embedding=0.5")
+    weighed = configs.override(weighed, "agent.loss_scales.reward=2")
+    scales = configs.with_method(weighed, "ne_dreamer/no_shift").agent.loss_scales
+    assert (scales["next_embedding"], scales["reward"]) == (0.5, 2)
+    scales = configs.with_method(weighed, "r2dreamer").agent.loss_scales
+    assert (scales["same_step"], scales["reward"]) == (0.05, 2)
+    assert "next_embedding" not in scales
+
+
+@pytest.mark.parametrize(
+    ("assignments", "method"),
+    [
+        (["agent.objective.redundancy=0.1"], "ne_dreamer"),
+        (["agent.objective.shift=0"], "ne_dreamer/no_shift"),
+        (["agent.objective.shift=0", "agent.objective.predictor.layers=0"], "ne_dreamer/no_transformer+no_shift"),
+        (["agent.objective=SameStep", "agent.objective.redundancy=0.1"], "r2dreamer"),
+        (["agent.objective=SameStep", "agent.objective=NextEmbedding"], "ne_dreamer"),
+    ],
+)
+def test_the_name_of_the_method_follows_the_settings(assignments, method):
+    config = configs.preset("dmc")
+    for assignment in assignments:
+        config = configs.override(config, assignment)
+    assert config.method == method
     make_agent(config.agent, tiny.VECTORS)
 
 
@@ -173,6 +219,7 @@ CHANGES = {
         "batch_size": "3",
         "batch_length": "6",
         "compute_dtype": "bfloat16",
+        "objective": "SameStep",
         "behavior.slow_rate": "0.1",
         **{f"loss_scales.{name}": "0.7" for name in tiny.CONFIG.loss_scales},
     },
@@ -209,8 +256,8 @@ def acting(agent, spec):
 
 
 def rollout_of(nets):
-    """A rollout made of zeros, and posterior logits."""
-    batch = tiny.batch(tiny.VECTORS)
+    """A rollout made of zeros."""
+    batch = tiny.batch(nets.spec)
     latent = tiny.latent((2, 5))
     action = jnp.zeros((2, 5, 2))
     feature = jnp.zeros((2, 5, nets.feature))
@@ -226,16 +273,19 @@ def world(config):
     yield program(losses, params)
 
 
-def objective(config):
+def objective(config, spec=tiny.VECTORS):
     """The objective's parameters and loss."""
-    nets = tiny.networks(tiny.VECTORS)
-    functions = config.agent.objective.build(tiny.sizes(nets))
-    params = {"objective": jax.eval_shape(functions.init, KEY)}
+    nets = tiny.networks(spec, config.agent)
+    functions = config.agent.objective.build(tiny.model(nets))
+    params = {**jax.eval_shape(nets.init, KEY), "objective": jax.eval_shape(functions.init, KEY)}
     yield str(params)
+    target = jax.eval_shape(functions.init_target, params)
+    yield program(functions.after_update, params, target, jnp.ones((), jnp.int32))
     rollout = rollout_of(nets)
     yield program(
-        lambda p, action, prev: functions.loss(p, {}, KEY, rollout._replace(action=action, prev_action=prev)),
+        lambda p, t, action, prev: functions.loss(p, t, KEY, rollout._replace(action=action, prev_action=prev)),
         params,
+        target,
         rollout.action,
         rollout.prev_action,
     )
@@ -289,7 +339,32 @@ PROBES = {
 }
 
 
-def test_every_setting_is_listed_below():
+# What the other objectives have of their own: one of the least size, and a change of every field.
+OBJECTIVES: dict[type, tuple] = {
+    SameStep: (SameStep(), {"redundancy": "0.1"}),
+    Reconstruction: (Reconstruction(blocks=1), {"blocks": "2"}),
+    NoObjective: (NoObjective(), {}),
+}
+
+
+@pytest.mark.parametrize("kind", OBJECTIVES)
+def test_every_setting_of_the_other_objectives_changes_something(kind):
+    small, changes = OBJECTIVES[kind]
+    agent = tiny.with_method(small, replace(tiny.CONFIG, encoder=replace(tiny.CONFIG.encoder, depth=2)))
+    base = replace(BASE, agent=agent)
+    assert set(changes) == {field.name for field in fields(kind)}
+    without = list(objective(base, tiny.BOTH))
+    for name, value in changes.items():
+        changed = configs.override(base, f"agent.objective.{name}={value}")
+        assert list(objective(changed, tiny.BOTH)) != without, name
+
+
+def test_every_objective_has_been_asked():
+    assert {NextEmbedding, *OBJECTIVES} == set(typing.get_args(objectives.AnyObjective))
+    assert {type(config(NextEmbedding())) for config in configs.METHODS.values()} == {NextEmbedding, *OBJECTIVES}
+
+
+def test_every_setting_is_listed_above():
     listed = {f"{group}.{name}" for group, fields in CHANGES.items() for name in fields}
     assert listed == {path for path in settings.paths(BASE) if path.startswith(("agent.", "loop."))}
 
@@ -305,7 +380,7 @@ def test_every_setting_changes_something(group):
 
     without_effect = []
     for name, value in CHANGES[group].items():
-        changed = settings.override(BASE, f"{group}.{name}={value}")
+        changed = configs.override(BASE, f"{group}.{name}={value}")
         if all(text == before(i) for i, text in enumerate(PROBES[group](changed))):
             without_effect.append(name)
     assert without_effect == []

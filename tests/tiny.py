@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.agent import AgentConfig
+from ne_dreamer_jax.agent import BASE_LOSS_SCALES, AgentConfig, world_model_of
 from ne_dreamer_jax.behavior import BehaviorConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
-from ne_dreamer_jax.objectives import NextEmbedding, Sizes
+from ne_dreamer_jax.objectives import Model, NextEmbedding
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, DiscreteAction, EnvSpec, Latent
 
@@ -43,9 +43,14 @@ def networks(spec: EnvSpec = BOTH, config: AgentConfig = CONFIG, dtype: Any = jn
     return Networks.build(spec, config.encoder, config.rssm, config.heads, dtype)
 
 
-def sizes(nets: Networks, config: AgentConfig = CONFIG) -> Sizes:
+def model(nets: Networks, config: AgentConfig = CONFIG) -> Model:
     """What an objective of the agent is built for."""
-    return Sizes(nets.spec, nets.feature, nets.embedding, config.batch_length, nets.dtype)
+    return world_model_of(nets, config.batch_length)
+
+
+def with_method(objective: Any, config: AgentConfig = CONFIG) -> AgentConfig:
+    """The tiny agent with another objective, its losses weighed as its authors do."""
+    return replace(config, objective=objective, loss_scales={**BASE_LOSS_SCALES, **objective.losses})
 
 
 def fill(shapes: Any, seed: int = 0, std: float = 0.3) -> Any:

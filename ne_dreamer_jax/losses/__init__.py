@@ -9,6 +9,7 @@ statistics of the whole batch and return a scalar.
 from ne_dreamer_jax.losses.actor_critic import critic_loss, dynamics_loss, reinforce_loss
 from ne_dreamer_jax.losses.barlow import barlow_twins, next_embedding_loss
 from ne_dreamer_jax.losses.kl import balanced_kl, categorical_kl, unimix_logits
+from ne_dreamer_jax.losses.reconstruction import image_loss, vector_loss
 from ne_dreamer_jax.losses.returns import lambda_returns, return_scale, update_percentiles
 from ne_dreamer_jax.losses.twohot import symexp, symexp_bins, symlog, twohot_encode, twohot_loss, twohot_mean
 
@@ -18,6 +19,7 @@ __all__ = [
     "categorical_kl",
     "critic_loss",
     "dynamics_loss",
+    "image_loss",
     "lambda_returns",
     "next_embedding_loss",
     "reinforce_loss",
@@ -30,4 +32,5 @@ __all__ = [
     "twohot_mean",
     "unimix_logits",
     "update_percentiles",
+    "vector_loss",
 ]

@@ -5,20 +5,21 @@ An objective is chosen by the type of a frozen dataclass in the config, whose ``
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
 
-from ne_dreamer_jax.types import Array, EnvSpec, Metrics, Params, Rollout
+from ne_dreamer_jax.nets.networks import Networks
+from ne_dreamer_jax.types import Array, Batch, Metrics, Params, Rollout
 
 
-class Sizes(NamedTuple):
-    """What an objective's own networks are built for."""
+class Model(NamedTuple):
+    """The world model that an objective is built for, and what it may use of it."""
 
-    spec: EnvSpec
-    feature: int  # F
-    embedding: int  # E
+    nets: Networks
     length: int  # T
-    dtype: Any  # of the matrix products
+    unroll: Callable[[Params, Array, Batch], Rollout]
+    """(params, key, batch) -> encodes a batch and unrolls the posterior along it; images may be float32, as the
+    encoder's stages take them. For objectives that look at other views of the observations."""
 
 
 class Objective(NamedTuple):
@@ -38,11 +39,16 @@ class ObjectiveConfig(Protocol):
     """A frozen dataclass with an objective's settings."""
 
     @property
-    def losses(self) -> tuple[str, ...]:
-        """Names of the losses that `build`'s objective returns."""
+    def losses(self) -> Mapping[str, float]:
+        """The losses that `build`'s objective returns, each with the weight that the method's authors give it."""
         ...
 
-    def build(self, sizes: Sizes) -> Objective:
+    @property
+    def method(self) -> str:
+        """Name of the method that these settings make of an agent, such as ``ne_dreamer/no_shift``."""
+        ...
+
+    def build(self, model: Model) -> Objective:
         """The objective's functions."""
         ...
 

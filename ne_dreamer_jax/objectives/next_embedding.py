@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import next_embedding_loss
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
-from ne_dreamer_jax.objectives.base import Objective, Sizes, keep_target, no_target
+from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
 from ne_dreamer_jax.types import Array, DiscreteAction, Metrics, Params, Rollout
 
 
@@ -37,25 +38,36 @@ class NextEmbedding:
             raise ValueError(f"objective.shift: expected 0 or more, got {self.shift}.")
 
     @property
-    def losses(self) -> tuple[str, ...]:
-        """Names of the losses."""
-        return ("next_embedding",)
+    def losses(self) -> Mapping[str, float]:
+        """Names and weights of the losses."""
+        return {"next_embedding": 1.0}
 
-    def build(self, sizes: Sizes) -> Objective:
-        """The objective's functions, for networks of these sizes.
+    @property
+    def method(self) -> str:
+        """Name of the method, with what is ablated."""
+        ablated = {
+            "no_transformer": self.predictor.layers == 0,
+            "no_shift": self.shift == 0,
+            "no_projector": not self.predictor.projector,
+        }
+        return "/".join(["ne_dreamer", *filter(None, ["+".join(name for name, absent in ablated.items() if absent)])])
+
+    def build(self, model: Model) -> Objective:
+        """The objective's functions.
 
         Raises ValueError where sequences are too short for the shift, or too long for the predictor's positions.
         """
-        if self.shift >= sizes.length:
+        if self.shift >= model.length:
             raise ValueError(
-                f"objective.shift: expected less than agent.batch_length {sizes.length}, got {self.shift}."
+                f"objective.shift: expected less than agent.batch_length {model.length}, got {self.shift}."
             )
-        check_length(self.predictor, sizes.length)
-        discrete = isinstance(sizes.spec.action, DiscreteAction)
-        predictor = Predictor(self.predictor, sizes.embedding, discrete, self.across_episodes, sizes.dtype)
+        check_length(self.predictor, model.length)
+        nets, space = model.nets, model.nets.spec.action
+        discrete = isinstance(space, DiscreteAction)
+        predictor = Predictor(self.predictor, nets.embedding, discrete, self.across_episodes, nets.dtype)
 
         def init(key: Array) -> Params:
-            feature, action = jnp.zeros((1, 1, sizes.feature)), jnp.zeros((1, 1, sizes.spec.action.size))
+            feature, action = jnp.zeros((1, 1, nets.feature)), jnp.zeros((1, 1, space.size))
             return predictor.init(key, feature, action, jnp.zeros((1, 1), bool))["params"]
 
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:

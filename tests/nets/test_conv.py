@@ -55,6 +55,15 @@ def test_conv2d_equals_lax(shape, taps, out):
     _assert_close(_with_gradients(conv.conv2d, g, x, kernel), _with_gradients(_lax_conv, g, x, kernel))
 
 
+@pytest.mark.parametrize("taps", [5, 3, 4, 1])
+@pytest.mark.parametrize("shape", [(3, 4, 4, 6), (2, 3, 5, 4)])
+def test_convolution_after_upsampling_equals_its_definition(shape, taps):
+    N, H, W, C = shape
+    x, kernel, g = _normal(0, *shape), _normal(1, taps, taps, C, 3), _normal(2, N, 2 * H, 2 * W, 3)
+    definition = lambda x, kernel: _lax_conv(jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2), kernel)
+    _assert_close(_with_gradients(conv.upsampled_conv2d, g, x, kernel), _with_gradients(definition, g, x, kernel))
+
+
 def _stages(channels, taps=5):
     return [
         Stage(

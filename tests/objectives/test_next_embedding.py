@@ -1,6 +1,7 @@
 """What the next-embedding objective is computed from, what it trains, and that it learns what can be predicted."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 
 from ne_dreamer_jax.losses import next_embedding_loss
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig
-from ne_dreamer_jax.objectives import NextEmbedding, Sizes
+from ne_dreamer_jax.objectives import Model, NextEmbedding
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, EnvSpec, Rollout
 from tests import tiny
 
@@ -19,6 +20,11 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 A, E, F = 3, 4, 5
 SPEC = EnvSpec({"vector": ArraySpec((E,), jnp.float32)}, ContinuousAction(A))
 CONFIG = NextEmbedding(PredictorConfig(layers=1, width=16, heads=2, feedforward=16, positions=8))
+
+
+def model(length):
+    """A world model of these sizes; its networks are none of the objective's business."""
+    return Model(SimpleNamespace(spec=SPEC, feature=F, embedding=E, dtype=jnp.float32), length, None)
 
 
 def rollout_of(feature, embedding, action, prev_action, is_first):
@@ -37,7 +43,7 @@ def noise(seed=0, rows=3, length=6):
 
 def make(**changes):
     config = replace(CONFIG, **changes)
-    objective = config.build(Sizes(SPEC, F, E, 6, jnp.float32))
+    objective = config.build(model(6))
     params = {"objective": tiny.fill(jax.eval_shape(objective.init, jax.random.key(0)))}
     return config, objective, params
 
@@ -57,7 +63,7 @@ def test_the_loss_is_of_the_predictor_and_the_settings(changes):
     rollout = noise()
     is_first = rollout.batch.is_first
     losses, metrics = jax.jit(objective.loss)(params, {}, jax.random.key(0), rollout)
-    assert tuple(losses) == config.losses == ("next_embedding",)
+    assert tuple(losses) == tuple(config.losses) == ("next_embedding",)
     predictor = Predictor(config.predictor, E, False, config.across_episodes)
     action = rollout.prev_action if changes.get("action") == "previous" else rollout.action
     predicted = predictor.apply({"params": params["objective"]}, rollout.feature, action, is_first)
@@ -109,7 +115,7 @@ def toy(key, rows, length):
 
 def diagonal_after_training(config, updates=250):
     """Mean correlation of prediction and target on new data."""
-    objective = config.build(Sizes(SPEC, F, E, 8, jnp.float32))
+    objective = config.build(model(8))
     params = {"objective": tiny.fill(jax.eval_shape(objective.init, jax.random.key(0)))}
     optimizer = optax.adam(5e-3)
 
@@ -156,4 +162,4 @@ def test_settings_out_of_range_are_refused(changes, message):
 )
 def test_settings_that_do_not_fit_the_sequences_are_refused(changes, length, message):
     with pytest.raises(ValueError, match=message):
-        replace(CONFIG, **changes).build(Sizes(SPEC, F, E, length, jnp.float32))
+        replace(CONFIG, **changes).build(model(length))

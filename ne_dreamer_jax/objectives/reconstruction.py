@@ -1,0 +1,64 @@
+"""DreamerV3's objective: decode the observation from the latent state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from ne_dreamer_jax.losses import image_loss, vector_loss
+from ne_dreamer_jax.nets.decoder import Decoder
+from ne_dreamer_jax.nets.rssm import initial_latent
+from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
+from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Settings of the reconstruction objective. The decoder's sizes are the encoder's.
+
+    The observation of a step is decoded from the posterior state of the same step; images by the squared error of
+    image / 255 summed over pixels and channels, vectors by that of their symlog, averaged over B and T.
+
+    Source: DreamerV3 (Hafner et al., 2025).
+    """
+
+    blocks: int = 8
+    """Blocks of the decoder's linear map from the deterministic state."""
+
+    @property
+    def losses(self) -> Mapping[str, float]:
+        """Names and weights of the losses."""
+        return {"reconstruction": 1.0}
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return "dreamerv3"
+
+    def build(self, model: Model) -> Objective:
+        """The objective's functions. Raises ValueError where the blocks don't divide the sizes."""
+        nets = model.nets
+        decoder = Decoder(nets.encoder.config, nets.spec.observation, self.blocks, nets.dtype)
+
+        def init(key: Array) -> Params:
+            return decoder.init(key, initial_latent(nets.rssm.config, (1,)))["params"]
+
+        def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
+            decoded: Any = decoder.apply({"params": params["objective"]}, rollout.latent)
+            errors = {}
+            for name, predicted in decoded.items():
+                observed = rollout.batch.obs[name]
+                of_image = observed.dtype == jnp.uint8
+                each = (
+                    image_loss(predicted, observed)
+                    if of_image
+                    else vector_loss(predicted, observed.reshape(predicted.shape))
+                )
+                errors[name] = jnp.mean(each)
+            total = sum(errors.values(), jnp.zeros(()))
+            return {"reconstruction": total}, {f"reconstruction/{name}": x for name, x in errors.items()}
+
+        return Objective(init, no_target, loss, keep_target)

@@ -1,0 +1,72 @@
+"""The decoder mirrors the encoder: shapes, names and ranges of what it decodes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ne_dreamer_jax.nets.decoder import Decoder
+from ne_dreamer_jax.types import ArraySpec
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+OBSERVATION = {
+    "front": ArraySpec((8, 12, 3), jnp.uint8),
+    "depth": ArraySpec((8, 12, 1), jnp.uint8),
+    "speed": ArraySpec((), jnp.float32),
+    "joints": ArraySpec((3,), jnp.float32),
+}
+ENCODER = replace(tiny.CONFIG.encoder, depth=2, multipliers=(2, 4))
+
+
+def make(observation, blocks=4, dtype=jnp.float32):
+    decoder = Decoder(ENCODER, observation, blocks, dtype)
+    return decoder, tiny.fill(jax.eval_shape(decoder.init, jax.random.key(0), tiny.latent((1,))))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_every_observation_is_decoded_in_its_shape(dtype):
+    decoder, params = make(OBSERVATION, dtype=dtype)
+    decoded = jax.jit(decoder.apply)(params, tiny.latent((2, 5)))
+    shapes = {name: (2, 5, *(spec.shape or (1,))) for name, spec in OBSERVATION.items()}
+    assert {name: x.shape for name, x in decoded.items()} == shapes
+    assert {x.dtype for x in decoded.values()} == {jnp.dtype(jnp.float32)}
+    for name in ("front", "depth"):
+        assert 0 < decoded[name].min() < decoded[name].max() < 1
+    assert np.abs(decoded["joints"]).max() > 1  # unbounded
+
+
+def test_a_latent_is_decoded_by_itself():
+    decoder, params = make(OBSERVATION)
+    latent = tiny.latent((3, 4))
+    whole = decoder.apply(params, latent)
+    one = decoder.apply(params, jax.tree.map(lambda x: x[1, 2], latent))
+    for name, x in one.items():
+        np.testing.assert_allclose(x, whole[name][1, 2], rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_not_observed_has_no_parameters():
+    _, images = make({"front": OBSERVATION["front"]})
+    _, vectors = make({"joints": OBSERVATION["joints"]})
+    assert not {"mlp", "vectors"} & set(images["params"])
+    assert set(vectors["params"]) == {"mlp", "vectors"}
+
+
+def test_each_block_of_the_state_fills_channels_of_its_own():
+    decoder, params = make({"front": OBSERVATION["front"]}, blocks=4)
+    latent = tiny.latent((1,))
+    maps = lambda deter: decoder.apply(params, deter, 2, 3, 8, method=lambda m, *args: m._from_deter(*args))
+    jacobian = jax.jit(jax.jacobian(maps))(latent.deter)[0, ..., 0, :]  # [2, 3, 8, D]
+    touched = np.any(np.asarray(jacobian), axis=(0, 1)).reshape(4, 2, 4, 8)  # channels and state by block
+    for of, by in np.ndindex(4, 4):
+        assert touched[of, :, by].all() if of == by else not touched[of, :, by].any()
+
+
+def test_blocks_that_do_not_divide_the_sizes_are_refused():
+    with pytest.raises(
+        ValueError, match=r"objective.blocks: expected a divisor of rssm.deter 32 .* 8 channels .* got 3"
+    ):
+        make({"front": OBSERVATION["front"]}, blocks=3)
