@@ -18,6 +18,12 @@ from ne_dreamer_jax.nets.rssm import feature
 from ne_dreamer_jax.types import Array, ArraySpec, Latent
 
 
+def spread_blocks(x: Array, height: int, width: int) -> Array:
+    """``[N, G, height * width * C]`` to ``[N, height, width, G * C]``: each block fills C channels of its own."""
+    N, G = x.shape[:2]
+    return x.reshape(N, G, height, width, -1).transpose(0, 2, 3, 1, 4).reshape(N, height, width, -1)
+
+
 class Decoder(nn.Module):
     """Images from a block-linear map of h_t plus a two-layer path from z_t, upsampled by 5x5 convolutions; vectors by a
     multilayer perceptron on the feature.
@@ -67,7 +73,7 @@ class Decoder(nn.Module):
         return nn.sigmoid(self._upsampled(x, "stage0", channels))
 
     def _from_deter(self, deter: Array, height: int, width: int, channels: int) -> Array:
-        """``[N, D]`` to ``[N, height, width, channels]``: each block of the state fills channels of its own."""
+        """``[N, D]`` to ``[N, height, width, channels]``."""
         blocks, size = self.blocks, deter.shape[-1]
         if size % blocks or channels % blocks:
             raise ValueError(
@@ -78,8 +84,7 @@ class Decoder(nn.Module):
         kernel = self.param("deter_kernel", kernel_init(), (blocks, size // blocks, outputs), jnp.float32)
         bias = self.param("deter_bias", initializers.zeros_init(), (blocks, outputs), jnp.float32)
         x = block_linear(deter.reshape(-1, blocks, size // blocks).astype(self.dtype), kernel.astype(self.dtype))
-        x = (x + bias.astype(self.dtype)[None]).reshape(-1, blocks, height, width, channels // blocks)
-        return x.transpose(0, 2, 3, 1, 4).reshape(-1, height, width, channels)
+        return spread_blocks(x + bias.astype(self.dtype)[None], height, width)
 
     def _upsampled(self, x: Array, name: str, channels: int) -> Array:
         side = self.config.kernel
