@@ -47,7 +47,7 @@ class Decoder(nn.Module):
         images, vectors = split_observation(self.observation)
         lead = latent.deter.shape[:-1]
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), latent)
-        outputs = {}
+        outputs: dict[str, Array] = {}
         if images:
             channels = [self.observation[name].shape[2] for name in images]
             decoded = jnp.split(self._images(flat, sum(channels)), np.cumsum(channels[:-1]), axis=-1)
