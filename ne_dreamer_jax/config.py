@@ -18,7 +18,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
-from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding, NoObjective, Reconstruction, SameStep
+from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.settings import did_you_mean
 
@@ -159,6 +159,7 @@ METHODS: dict[str, Callable[[AnyObjective], AnyObjective]] = {
     "ne_dreamer/no_projector": lambda objective: _next_embedding(objective, projector=False),
     "dreamerv3": lambda objective: Reconstruction(),
     "r2dreamer": lambda objective: SameStep(),
+    "dreamerpro": lambda objective: DreamerPro(),
     "dreamer_no_reconstruction": lambda objective: NoObjective(),
 }
 """Method -> its objective, made from that of a config."""

@@ -10,6 +10,7 @@ METHODS = (
     "ne_dreamer/no_projector",
     "dreamerv3",
     "r2dreamer",
+    "dreamerpro",
     "dreamer_no_reconstruction",
 )
 PRESETS = ("dmc", "quickstart", "smoke")

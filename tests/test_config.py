@@ -16,7 +16,7 @@ from ne_dreamer_jax.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.behavior import actor_critic_losses
 from ne_dreamer_jax.config import Config, EnvConfig
 from ne_dreamer_jax.loop import LoopConfig
-from ne_dreamer_jax.objectives import NextEmbedding, NoObjective, Reconstruction, SameStep
+from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout
 from tests import counting, tiny
 from tests.tiny import program
@@ -344,6 +344,20 @@ OBJECTIVES: dict[type, tuple] = {
     SameStep: (SameStep(), {"redundancy": "0.1"}),
     Reconstruction: (Reconstruction(blocks=1), {"blocks": "2"}),
     NoObjective: (NoObjective(), {}),
+    DreamerPro: (
+        DreamerPro(prototypes=7, dimension=3),
+        {
+            "prototypes": "8",
+            "dimension": "4",
+            "temperature": "0.2",
+            "epsilon": "0.1",
+            "iterations": "2",
+            "teacher_rate": "0.1",
+            "frozen_updates": "5",
+            "max_shift": "1",
+            "warm_up": "2",
+        },
+    ),
 }
 
 

@@ -17,7 +17,7 @@ from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
-from ne_dreamer_jax.objectives import Model, NextEmbedding
+from ne_dreamer_jax.objectives import DreamerPro, Model, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, DiscreteAction, EnvSpec, Latent
 
@@ -36,6 +36,16 @@ CONFIG = AgentConfig(
     batch_size=2,
     batch_length=5,
 )
+
+
+OBJECTIVES: dict[str, Any] = {
+    "ne_dreamer": CONFIG.objective,
+    "dreamerv3": Reconstruction(blocks=1),
+    "r2dreamer": SameStep(),
+    "dreamerpro": DreamerPro(prototypes=7, dimension=3),
+    "dreamer_no_reconstruction": NoObjective(),
+}
+"""Method -> its objective at the tiny agent's size."""
 
 
 def networks(spec: EnvSpec = BOTH, config: AgentConfig = CONFIG, dtype: Any = jnp.float32) -> Networks:

@@ -11,9 +11,11 @@ from ne_dreamer_jax.losses.barlow import barlow_twins, next_embedding_loss
 from ne_dreamer_jax.losses.kl import balanced_kl, categorical_kl, unimix_logits
 from ne_dreamer_jax.losses.reconstruction import image_loss, vector_loss
 from ne_dreamer_jax.losses.returns import lambda_returns, return_scale, update_percentiles
+from ne_dreamer_jax.losses.swav import assignment_loss, sinkhorn
 from ne_dreamer_jax.losses.twohot import symexp, symexp_bins, symlog, twohot_encode, twohot_loss, twohot_mean
 
 __all__ = [
+    "assignment_loss",
     "balanced_kl",
     "barlow_twins",
     "categorical_kl",
@@ -24,6 +26,7 @@ __all__ = [
     "next_embedding_loss",
     "reinforce_loss",
     "return_scale",
+    "sinkhorn",
     "symexp",
     "symexp_bins",
     "symlog",
