@@ -67,6 +67,8 @@ class Pace:
             parts.append(f"return {values['train/return']:.1f}")
         if "train/loss/total" in values:
             parts.append(f"loss {values['train/loss/total']:.4g}")
+        if values.get("train/faults"):
+            parts.append(f"episodes cut by broken physics: {values['train/faults']:.0f}")
         parts.append(self._left(step))
         return "  ".join(parts)
 

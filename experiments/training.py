@@ -192,7 +192,7 @@ def _named(values: Mapping[str, Any], before: Counters, after: Counters, seconds
     of_episodes = {"return", "length"}
     absent = set() if values["episodes"] > 0 else of_episodes
     if after.update == before.update:
-        absent |= set(values) - of_episodes - {"episodes"}
+        absent |= set(values) - of_episodes - {"episodes", "faults"}
     rates = {
         "time/chunk_seconds": seconds,
         "time/env_steps_per_second": (after.env_step - before.env_step) / seconds,

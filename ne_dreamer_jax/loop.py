@@ -199,7 +199,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         metric_shapes = jax.eval_shape(agent.train_step, state.train, batch)[2]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metric_shapes)
         episode_sums = {name: jnp.zeros(()) for name in ("return", "length", "episodes")}
-        before = state.train.update
+        before, faults_before = state.train.update, jnp.sum(state.env.faults)
         state, sums, episode_sums = jax.lax.fori_loop(
             0, steps, lambda _, carry: vector_step(*carry), (state, sums, episode_sums)
         )
@@ -208,6 +208,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         metrics = {name: value / count for name, value in sums.items()}
         finished = episode_sums.pop("episodes")
         metrics |= {name: value / finished for name, value in episode_sums.items()} | {"episodes": finished}
+        # Episodes that the environments cut because their physics broke down.
+        metrics["faults"] = (jnp.sum(state.env.faults) - faults_before).astype(jnp.float32)
         return state, metrics
 
     def eval_init(key: Array, episodes: int) -> tuple:

@@ -39,10 +39,11 @@ def reward_of(t: Any, effect: Any) -> Any:
     return t + 0.25 * effect
 
 
-def env(discrete: bool = False, image: bool = True) -> Env:
+def env(discrete: bool = False, image: bool = True, breaks: bool = False) -> Env:
     """The observation is (name, t, effect of the action that led here), and an image full of t.
 
-    Episodes with an even name end terminally, the others by a time limit.
+    Episodes with an even name end terminally, the others by a time limit. Where it ``breaks``, those whose name three
+    divides do so at step 1.
     """
     action = DiscreteAction(3) if discrete else ContinuousAction(1)
     observation = {"vector": ArraySpec((3,), jnp.float32)}
@@ -57,7 +58,8 @@ def env(discrete: bool = False, image: bool = True) -> Env:
         state = Count(state.name, state.t + 1, effect)
         is_last = state.t >= length_of(state.name)
         reward = reward_of(state.t.astype(jnp.float32), effect)
-        return state, Progress(reward, is_last, is_last & (state.name % 2 == 0), jnp.ones((), bool))
+        broken = (state.name % 3 == 0) & (state.t == 1) & breaks
+        return state, Progress(reward, is_last, is_last & (state.name % 2 == 0), ~broken)
 
     def observe(state: Count) -> dict[str, jax.Array]:
         seen = [state.name.astype(jnp.float32), state.t.astype(jnp.float32), state.effect]

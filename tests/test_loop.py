@@ -97,9 +97,26 @@ def test_reported_episodes_are_the_true_ones(filled):
                 lengths.append(t - begin)  # the first observation took no step
                 begin = t + 1
     assert len(returns) > 2 * N
+    assert filled.metrics["faults"] == 0
     assert filled.metrics["episodes"] == len(returns)
     np.testing.assert_allclose(filled.metrics["return"], np.mean(returns), rtol=1e-6)
     np.testing.assert_allclose(filled.metrics["length"], np.mean(lengths), rtol=1e-6)
+
+
+def test_broken_episodes_are_cut_and_counted_chunk_by_chunk():
+    env = counting.env(image=False, breaks=True)
+    loop = loops.make(dataclasses.replace(CONFIG, prefill=1000), env, counting.stub(env.spec), action_repeat=2)
+    state, metrics = ran(loop, 8, STEPS - 8)
+    data = jax.device_get(state.replay.data)
+    name, t, _ = np.moveaxis(data.obs["vector"], -1, 0)
+    broken = (name % 3 == 0) & (t == 1)
+    assert broken[:8].any()
+    assert broken[8:].any()
+    assert [chunk["faults"] for chunk in metrics] == [broken[:8].sum(), broken[8:].sum()]
+    assert data.is_last[broken].all()
+    assert not data.is_terminal[broken].any()
+    assert not data.reward[broken].any()
+    assert data.is_first[1:][broken[:-1]].all()
 
 
 @pytest.fixture(scope="module")

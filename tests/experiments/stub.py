@@ -53,7 +53,7 @@ def build(config, *, image: bool = True) -> training.Run:
             "return": kernel / episodes * episodes,
             "length": episodes / episodes,
         }
-        return state, metrics | {"episodes": episodes}
+        return state, metrics | {"episodes": episodes, "faults": jnp.zeros(())}
 
     def evaluate(params, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False):
         count = episodes or config.loop.eval_episodes

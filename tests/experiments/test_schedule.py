@@ -72,6 +72,9 @@ def test_the_time_left_counts_chunks_that_learned_and_evaluations_to_come():
         "loss 2.5",
         "46 s left",  # 80 steps of 0.4 s and two evaluations
     ]
+    third = pace.line(counters[2], counters[3], {"train/faults": 2.0}, seconds=4.0)
+    assert "episodes cut by broken physics: 2" in third.split("  ")
+    assert "broken" not in pace.line(counters[2], counters[3], {"train/faults": 0.0}, seconds=4.0)
 
 
 def test_one_signal_asks_and_the_second_insists():

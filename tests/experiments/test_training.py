@@ -72,6 +72,7 @@ def test_a_finished_run_leaves_its_files(finished):
 def test_metrics_count_steps_updates_and_episodes(finished):
     lines = measured(finished[0])
     chunks = [line for line in lines if "train/episodes" in line]
+    assert all(line["train/faults"] == 0 for line in chunks)
     assert [line["env_step"] for line in chunks] == [16, 32, 48, 64, 80, 96, 112, 120]
     assert all(line["agent_step"] == line["env_step"] for line in lines)  # action repeat 1
     assert chunks[-1]["update"] == stub.run().loop.updates == 50
