@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes.util
+import functools
+import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
 
@@ -26,8 +29,22 @@ from ne_dreamer_jax import run_directory
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of these episodes' beginnings."
 )
+@click.option(
+    "--backend",
+    type=click.Choice(["mjx", "dm_control"]),
+    default="mjx",
+    show_default=True,
+    help="dm_control: play as many episodes there too, with C MuJoCo's physics and OpenGL pictures.",
+)
 @click.option("--video", "with_video", is_flag=True, help="Write one episode to policy.mp4 in the directory.")
-def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: int, with_video: bool) -> None:
+def main(
+    logdir: Path,
+    episodes: int,
+    prefer: Literal["best", "newest"],
+    seed: int,
+    backend: Literal["mjx", "dm_control"],
+    with_video: bool,
+) -> None:
     """Play episodes with the trained policy of a run, beside a random policy's on the same task.
 
     The actions are the policy's mode, the episodes none that training or its evaluations had. The result is printed
@@ -38,6 +55,8 @@ def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: i
             f"expected the --logdir of a run, got {logdir}: there is no {run_directory.MARKER} in it"
         )
     quiet()
+    if backend == "dm_control":
+        allow_opengl()
     import jax
     import numpy as np
 
@@ -49,6 +68,8 @@ def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: i
     files = run_directory.RunDirectory(logdir)
     with refusing(run_directory.RefusedError, ValueError):
         config = run_directory.read_config(logdir, Config)
+        if backend == "dm_control" and not config.env.task.startswith("dmc/"):
+            raise ValueError(f"--backend dm_control: expected a run of a dmc task, got one of {config.env.task}")
         # The smallest replay there is: none is read or allocated here, and the run's may not fit this machine.
         smallest = (config.agent.batch_length + 1) * config.loop.num_envs
         run = training.build(replace(config, loop=replace(config.loop, capacity=smallest)))
@@ -61,25 +82,40 @@ def main(logdir: Path, episodes: int, prefer: Literal["best", "newest"], seed: i
 
     params = restored.items["agent"].params
     policy_key, random_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), EVALUATION))
-    results = {}
-    for name, key in (("policy", policy_key), ("random", random_key)):
-        evaluation = run.loop.evaluate(params, key, episodes, random=name == "random", frames=True)
-        returns = np.asarray(evaluation.returns, np.float64)
-        results[name] = {
-            "mean": float(returns.mean()),
-            "std": float(returns.std()),
-            "returns": [float(value) for value in returns],
-            "lengths": [int(value) for value in evaluation.lengths],
-        }
-        click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes")
-        if name == "policy" and with_video:
-            if evaluation.frames is None:
-                click.echo("no video: this agent sees vectors, not pixels")
-            else:
-                video.write(evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND)
-                click.echo(f"{files.video} shows the first episode")
-    content = {"task": config.env.task, "env_step": env_step, "episodes": episodes, "seed": seed, **results}
+    evaluate = {"mjx": functools.partial(run.loop.evaluate, params, episodes=episodes, frames=True)}
+    if backend == "dm_control":
+        from experiments import control_suite
+
+        evaluate[backend] = functools.partial(control_suite.evaluate, config.env, run.agent, params, episodes=episodes)
+    content: dict[str, Any] = {"task": config.env.task, "env_step": env_step, "episodes": episodes, "seed": seed}
+    for place, play in evaluate.items():
+        results = {}
+        for name, key in (("policy", policy_key), ("random", random_key)):
+            with refusing(RuntimeError):
+                evaluation = play(key=key, random=name == "random")
+            returns = np.asarray(evaluation.returns, np.float64)
+            results[name] = {
+                "mean": float(returns.mean()),
+                "std": float(returns.std()),
+                "returns": [float(value) for value in returns],
+                "lengths": [int(value) for value in evaluation.lengths],
+            }
+            where = "" if place == "mjx" else f" in {place}"
+            click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
+            if place == "mjx" and name == "policy" and with_video:
+                if evaluation.frames is None:
+                    click.echo("no video: this agent sees vectors, not pixels")
+                else:
+                    video.write(evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND)
+                    click.echo(f"{files.video} shows the first episode")
+        content |= results if place == "mjx" else {place: results}
     run_directory.write_evaluation(files, content)
+
+
+def allow_opengl() -> None:
+    """Sets ``MUJOCO_GL`` to draw without a screen, unless it already names a way to draw; call before MuJoCo loads."""
+    if os.environ.get("MUJOCO_GL", "disable").lower() in ("", "disable", "disabled", "off", "0", "false", "no"):
+        os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
 
 
 EVALUATION = 0x65_76_61_6C  # sets these episodes apart from those of a run with the same seed
