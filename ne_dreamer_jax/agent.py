@@ -129,7 +129,7 @@ def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         latent = world_model.posterior_step(nets, params, latent_key, state, timestep)
         distribution = policy(config.heads, spec.action, nets.apply("actor", params, feature(latent)))
         raw = distribution.sample(action_key) if mode == "sample" else distribution.mode()
-        action = decode_action(spec.action, raw)
+        action = decode_action(spec.action, raw, config.heads.clip_actions)
         return PolicyState(latent, action), action
 
     def losses(params: Params, state: TrainState, key: Array, batch: Batch) -> tuple[Array, tuple]:

@@ -75,7 +75,7 @@ def imagine(nets: Networks, params: Params, key: Array, start: Latent, horizon: 
         state = feature(latent)
         raw = policy(nets.heads, nets.spec.action, nets.apply("actor", params, state)).sample(action_key)
         uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
-        action = model_action(nets.spec.action, raw)
+        action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
         after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
         return after, (state, raw)
 

@@ -21,6 +21,7 @@ from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.settings import did_you_mean
+from ne_dreamer_jax.world_model import WorldModelConfig
 
 SIZES: dict[str, dict[str, int]] = {
     # DreamerV3's sizes: deter D, hidden, classes K, encoder depth, units.
@@ -115,7 +116,25 @@ def smoke(size: str) -> Config:
     return Config(EnvConfig("dmc/cartpole_balance"), agent, loop)
 
 
-PRESETS = {"dmc": (dmc, "12m"), "quickstart": (quickstart, "1m"), "smoke": (smoke, "1m")}
+def released_code(size: str) -> Config:
+    """The paper's DeepMind Control setting as the authors' published code has it; see experiments/FIDELITY.md."""
+    base = agent_config(size)
+    agent = replace(
+        base,
+        heads=replace(base.heads, clip_actions=False),
+        world_model=WorldModelConfig(kl_unimix=0.0),
+        objective=NextEmbedding(action="previous", masked=False, across_episodes=True),
+        optimizer=OptimizerConfig(name="laprop"),
+    )
+    return Config(agent=agent, loop=LoopConfig(capacity=500_000, write_latents=False, time_limits="unmarked"))
+
+
+PRESETS = {
+    "dmc": (dmc, "12m"),
+    "released_code": (released_code, "12m"),
+    "quickstart": (quickstart, "1m"),
+    "smoke": (smoke, "1m"),
+}
 
 
 def preset(name: str, size: str | None = None) -> Config:

@@ -45,6 +45,9 @@ class LoopConfig:
     """Episodes of an evaluation, on environments of their own."""
     write_latents: bool = True
     """Whether the posterior latents of an update replace those in replay."""
+    time_limits: Literal["marked", "unmarked", "terminal"] = "marked"
+    """How replay holds an episode that a time limit cut: ``is_last`` without ``is_terminal``; neither, as the released
+    code for DeepMind Control; or both, as the released code for DeepMind Lab."""
     latent_dtype: Literal["float32", "bfloat16"] = "float32"
     """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
 
@@ -132,8 +135,12 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     step_envs, prepare_envs = jax.vmap(env.step), jax.vmap(env.prepare)
 
     def transition(timestep: TimeStep, policy: PolicyState, action: Array) -> Transition:
-        flags = (timestep.is_first, timestep.is_last, timestep.is_terminal)
-        return Transition(timestep.obs, action, timestep.reward, *flags, policy.latent)
+        is_last, is_terminal = timestep.is_last, timestep.is_terminal
+        if config.time_limits == "unmarked":
+            is_last = is_terminal
+        if config.time_limits == "terminal":
+            is_terminal = is_last
+        return Transition(timestep.obs, action, timestep.reward, timestep.is_first, is_last, is_terminal, policy.latent)
 
     def example() -> Transition:
         """The shapes of one vector step's transition."""

@@ -13,6 +13,6 @@ METHODS = (
     "dreamerpro",
     "dreamer_no_reconstruction",
 )
-PRESETS = ("dmc", "quickstart", "smoke")
+PRESETS = ("dmc", "released_code", "quickstart", "smoke")
 SIZES = ("1m", "12m", "25m", "50m", "100m", "200m", "400m")
 OBSERVATIONS = ("pixels", "vector", "both")

@@ -33,7 +33,8 @@ class WorldModelConfig:
 
 def posterior_rollout(nets: Networks, params: Params, key: Array, batch: Batch) -> tuple[Rollout, Array]:
     """Encodes a batch and unrolls the posterior along it: the rollout, and the posterior's logits [B, T, S, K]."""
-    action, prev_action = (encode_action(nets.spec.action, a) for a in (batch.action, batch.prev_action))
+    encode = lambda action: encode_action(nets.spec.action, action, nets.heads.clip_actions)
+    action, prev_action = encode(batch.action), encode(batch.prev_action)
     prev_action = mask_first(prev_action, batch.is_first)
     embedding = nets.apply("encoder", params, batch.obs)
     latent, logits = observe(nets.rssm, params["rssm"], key, batch.context, embedding, prev_action, batch.is_first)
@@ -44,7 +45,9 @@ def posterior_step(nets: Networks, params: Params, key: Array, policy: PolicySta
     """The posterior after one more observation of N environments, for acting."""
     rssm = nets.rssm
     call = lambda method, *args: rssm.apply({"params": params["rssm"]}, *args, method=method)
-    prev_action = mask_first(encode_action(nets.spec.action, policy.prev_action), timestep.is_first)
+    prev_action = mask_first(
+        encode_action(nets.spec.action, policy.prev_action, nets.heads.clip_actions), timestep.is_first
+    )
     uniform = jax.random.uniform(key, (*timestep.is_first.shape, rssm.config.stoch))
     observation_in = call(RSSM.embed_observation, nets.apply("encoder", params, timestep.obs))
     action_in = call(RSSM.embed_action, prev_action)

@@ -3,6 +3,7 @@
 import json
 import typing
 from dataclasses import fields, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -134,6 +135,25 @@ def test_the_defaults_are_the_papers():
     assert budget.updates * 16 * 64 / acting == pytest.approx(512, rel=1e-3)
 
 
+def test_the_released_code_differs_where_fidelity_says_so():
+    paper, code = (settings.paths(configs.preset(name, "12m")) for name in ("dmc", "released_code"))
+    assert {path: value for path, value in code.items() if paper[path] != value} == {
+        "agent.heads.clip_actions": False,
+        "agent.world_model.kl_unimix": 0.0,
+        "agent.objective.action": "previous",
+        "agent.objective.masked": False,
+        "agent.objective.across_episodes": True,
+        "agent.optimizer.name": "laprop",
+        "loop.capacity": 500_000,
+        "loop.write_latents": False,
+        "loop.time_limits": "unmarked",
+    }
+    fidelity = (Path(__file__).parents[1] / "experiments" / "FIDELITY.md").read_text()
+    for path in code:
+        if paper[path] != code[path]:
+            assert f"`{path}" in fidelity, path
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -179,6 +199,7 @@ CHANGES = {
         "min_std": "0.2",
         "max_std": "0.8",
         "unimix": "0.02",
+        "clip_actions": "false",
     },
     "agent.world_model": {"free_nats": "0.5", "kl_unimix": "0"},
     "agent.objective": {
@@ -233,6 +254,7 @@ CHANGES = {
         "eval_every": "300",
         "eval_episodes": "3",
         "write_latents": "false",
+        "time_limits": "unmarked",
         "latent_dtype": "bfloat16",
     },
 }

@@ -79,6 +79,16 @@ def test_replay_holds_every_step_in_the_time_convention(filled):
         np.testing.assert_array_equal(data.obs["image"], np.broadcast_to(t[..., None, None, None], (STEPS, N, 8, 8, 3)))
 
 
+@pytest.mark.parametrize(("time_limits", "field"), [("unmarked", "is_terminal"), ("terminal", "is_last")])
+def test_time_limits_are_held_as_asked(time_limits, field):
+    marked, other = (
+        ran(make(prefill=1000, time_limits=kind), STEPS)[0].replay.data for kind in ("marked", time_limits)
+    )
+    assert np.any(marked.is_last != marked.is_terminal)
+    want = getattr(marked, field)
+    assert_same(other, marked._replace(is_last=want, is_terminal=want))
+
+
 def test_the_state_goes_on_where_replay_ends(filled):
     policy, last = filled.state.policy, jax.tree.map(lambda x: x[STEPS - 1], filled.data)
     np.testing.assert_array_equal(policy.prev_action, last.action)

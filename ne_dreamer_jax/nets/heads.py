@@ -35,6 +35,9 @@ class HeadsConfig:
     """Greatest standard deviation of the bounded normal policy."""
     unimix: float = 0.01
     """Share of the uniform distribution in a discrete policy."""
+    clip_actions: bool = True
+    """Whether continuous actions are clipped to their bounds where they enter replay or a model (an environment clips
+    them itself). The released code doesn't: its recurrence divides by max(1, |a|), its predictor sees them as drawn."""
 
 
 class Head(nn.Module):
@@ -133,25 +136,25 @@ def policy(config: HeadsConfig, action: ActionSpec, outputs: Array) -> BoundedNo
     return BoundedNormal(jnp.tanh(mean), config.min_std + (config.max_std - config.min_std) * jax.nn.sigmoid(std + 2.0))
 
 
-def model_action(action: ActionSpec, raw: Array) -> Array:
+def model_action(action: ActionSpec, raw: Array, clip: bool = True) -> Array:
     """An action as the models see it, float32 [..., A]: a raw sample clipped to the bounds, or a one-hot as it is.
 
     The gradient passes the clipping unchanged.
     """
-    if isinstance(action, DiscreteAction):
+    if isinstance(action, DiscreteAction) or not clip:
         return raw
     return jax.lax.stop_gradient(jnp.clip(raw, -1.0, 1.0)) + (raw - jax.lax.stop_gradient(raw))
 
 
-def encode_action(action: ActionSpec, env_action: Array) -> Array:
+def encode_action(action: ActionSpec, env_action: Array, clip: bool = True) -> Array:
     """An action as the environment takes it to float32 [..., A], as the models see it."""
     if isinstance(action, DiscreteAction):
         return jax.nn.one_hot(env_action, action.size)
-    return jnp.clip(env_action, -1.0, 1.0)
+    return jnp.clip(env_action, -1.0, 1.0) if clip else env_action
 
 
-def decode_action(action: ActionSpec, model: Array) -> Array:
+def decode_action(action: ActionSpec, model: Array, clip: bool = True) -> Array:
     """The inverse of `encode_action`: what the environment takes."""
     if isinstance(action, DiscreteAction):
         return jnp.argmax(model, axis=-1).astype(jnp.int32)
-    return jnp.clip(model, -1.0, 1.0)
+    return jnp.clip(model, -1.0, 1.0) if clip else model

@@ -84,6 +84,13 @@ def test_actions_survive_the_way_to_the_models_and_back():
 
 
 @pytest.mark.parametrize("convert", [encode_action, decode_action, model_action])
+def test_clipping_can_be_left_out(convert):
+    raw = jnp.asarray([[-1.7, 0.3, 2.0]])
+    np.testing.assert_array_equal(convert(CONTINUOUS, raw, clip=False), raw)
+    assert np.abs(convert(CONTINUOUS, raw)).max() == 1
+
+
+@pytest.mark.parametrize("convert", [encode_action, decode_action, model_action])
 def test_actions_are_clipped_wherever_they_pass(convert):
     raw = jnp.asarray([[-4.3, 0.3, 1.7], [1.0, -1.0, 7.1]])
     np.testing.assert_array_equal(convert(CONTINUOUS, raw), np.clip(raw, -1, 1))
