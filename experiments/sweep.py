@@ -1,0 +1,180 @@
+"""Trains many runs, here or on a cluster: ``python -m experiments.sweep --help``.
+
+Each run is one `experiments.train` command with a directory of its own, so a sweep that is started again goes on with
+what is not finished. submitit starts them: as processes of this machine, or as SLURM jobs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from experiments.options import Name
+from ne_dreamer_jax import envs, names
+
+POLL = 2.0  # seconds between two looks at the jobs
+
+
+class Run(NamedTuple):
+    """One run of a sweep."""
+
+    name: str  # task/method/seed
+    logdir: Path
+    command: tuple[str, ...]
+
+
+class Job:
+    """Runs a command in a job; what a preempted job is put back in the queue with, and then goes on."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.command = tuple(command)
+        self._process: subprocess.Popen | None = None
+
+    def __call__(self) -> None:
+        """Waits for the command. Raises RuntimeError where it fails."""
+        self._process = subprocess.Popen(self.command)
+        code = self._process.wait()
+        if code:
+            raise RuntimeError(f"exit code {code}: {shlex.join(self.command)}")
+
+    def checkpoint(self) -> Any:
+        """What submitit asks for before a job is taken off its machine: lets the run save itself, and starts anew."""
+        from submitit.helpers import DelayedSubmission
+
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait()
+        return DelayedSubmission(Job(self.command))
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option("--task", "tasks", type=Name("task", envs.names()), multiple=True, required=True, help="May be repeated.")
+@click.option(
+    "--method",
+    "methods",
+    type=Name("method", names.METHODS),
+    multiple=True,
+    default=("ne_dreamer",),
+    show_default=True,
+    help="May be repeated.",
+)
+@click.option("--seeds", type=click.IntRange(1), metavar="N", default=3, show_default=True, help="Seeds 0 to N - 1.")
+@click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
+@click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
+@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As of experiments.train.")
+@click.option(
+    "--logdir", type=click.Path(path_type=Path), metavar="DIRECTORY", required=True, help="Runs are kept below."
+)
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Runs at a time.")
+@click.option("--slurm", is_flag=True, help="Submit SLURM jobs, instead of processes of this machine.")
+@click.option("--partition", help="With --slurm: the partition.")
+@click.option("--gpus", type=click.IntRange(0), default=1, show_default=True, help="With --slurm: GPUs of a job.")
+@click.option("--hours", type=click.IntRange(1), default=24, show_default=True, help="Time limit of a job.")
+@click.option("--dry-run", is_flag=True, help="Print the commands and exit.")
+def main(
+    tasks: tuple[str, ...],
+    methods: tuple[str, ...],
+    seeds: int,
+    preset: str,
+    size: str | None,
+    assignments: tuple[str, ...],
+    logdir: Path,
+    jobs: int,
+    slurm: bool,
+    partition: str | None,
+    gpus: int,
+    hours: int,
+    dry_run: bool,
+) -> None:
+    """Train every task with every method and seed.
+
+    \b
+    Example, on a cluster:
+      python -m experiments.sweep --task dmc/walker_walk --task dmc/cheetah_run --seeds 5 --slurm --jobs 10 \\
+        --logdir runs/sweep
+
+    Needs the extra "sweep": pip install -e '.[sweep]'.
+    """
+    if partition is not None and not slurm:
+        raise click.UsageError("expected --partition together with --slurm")
+    runs = plan(tasks, methods, range(seeds), preset, size, assignments, logdir)
+    if dry_run:
+        for run in runs:
+            click.echo(shlex.join(run.command))
+        return
+    try:
+        import submitit
+    except ImportError as error:
+        raise click.UsageError("sweeps need submitit: pip install -e '.[sweep]'") from error
+    executor = submitit.AutoExecutor(logdir / "jobs", cluster="slurm" if slurm else "local")
+    executor.update_parameters(timeout_min=60 * hours, name="ne_dreamer")
+    if slurm:
+        executor.update_parameters(gpus_per_node=gpus, **({"slurm_partition": partition} if partition else {}))
+    failed = launch(runs, executor, jobs, click.echo)
+    click.echo(f"{len(runs) - len(failed)} of {len(runs)} runs finished; their directories are in {logdir}.")
+    raise SystemExit(1 if failed else 0)
+
+
+def plan(
+    tasks: Sequence[str],
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    preset: str,
+    size: str | None,
+    assignments: Sequence[str],
+    logdir: Path,
+) -> list[Run]:
+    """All runs of a sweep, seed by seed, so that what comes first covers all tasks and methods."""
+    shared = ["--preset", preset, *(["--size", size] if size else [])]
+    shared += [word for assignment in assignments for word in ("--set", assignment)]
+    runs = []
+    for seed, task, method in itertools.product(seeds, dict.fromkeys(tasks), dict.fromkeys(methods)):
+        folder = logdir / task.replace("/", "_") / method.replace("/", "_") / f"seed{seed}"
+        own = ["--task", task, "--method", method, "--seed", str(seed), "--logdir", str(folder)]
+        command = (sys.executable, "-m", "experiments.train", *shared, *own)
+        runs.append(Run(f"{task} {method} seed {seed}", folder, command))
+    return runs
+
+
+def launch(runs: Sequence[Run], executor: Any, at_once: int, echo: Callable[[str], None]) -> list[Run]:
+    """Submits the runs, no more than some at once, waits for them all and tells how each ended.
+
+    Args:
+      executor: of submitit.
+
+    Returns:
+      The runs that failed.
+    """
+    waiting, failed = list(runs), []
+    running: dict[Run, Any] = {}
+    while waiting or running:
+        while waiting and len(running) < at_once:
+            run = waiting.pop(0)
+            running[run] = executor.submit(Job(run.command))
+            echo(f"started   {run.name}: {running[run].paths.stdout}")
+        for run, job in list(running.items()):
+            if not job.done():
+                continue
+            del running[run]
+            error = job.exception()
+            if error is None:
+                echo(f"finished  {run.name}")
+            else:
+                failed.append(run)
+                echo(f"failed    {run.name}: see {job.paths.stderr}")
+        if running:
+            time.sleep(POLL)
+    return failed
+
+
+if __name__ == "__main__":
+    main()
