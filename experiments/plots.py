@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +17,7 @@ from matplotlib.ticker import EngFormatter
 from ne_dreamer_jax import metrics
 
 TRAIN, EVALUATION, RANDOM = "#0072b2", "#d55e00", "#666666"  # of the Okabe-Ito palette: apart for every eye
+METHODS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8b5a2b", "#999999", "#000000")
 
 
 def learning_curve(
@@ -42,13 +45,71 @@ def learning_curve(
         axes.axhspan(mean - deviation, mean + deviation, color=RANDOM, alpha=0.12, lw=0)
         axes.axhline(mean, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({mean:.3g})")
     axes.set(title=title, xlabel="environment steps", ylabel="return of an episode", xlim=(0, env_steps))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.grid(alpha=0.25, lw=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
+    _style(axes)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, loc="best")
     else:
         axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=RANDOM)
+    _save(figure, path)
+
+
+def comparison(
+    curves: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]],
+    path: Path,
+    *,
+    title: str,
+    env_steps: int,
+    random_return: float | None = None,
+    published: Mapping[str, tuple[np.ndarray, np.ndarray]],
+) -> None:
+    """Draws evaluation returns of several methods into a PNG: each seed thin, the mean over seeds thick.
+
+    Args:
+      curves: method -> (environment steps ``[n]``, returns ``[n]``) of each seed.
+      path: of the PNG, replaced whole.
+      env_steps: the runs' budget.
+      random_return: mean of a random policy's returns.
+      published: label -> (environment steps, returns). What lies within the budget is drawn as a curve; if fewer than
+        two points do, the first point beyond it is drawn as a level.
+    """
+    figure = Figure(figsize=(7.8, 4.6), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    for color, (method, seeds) in zip(itertools.cycle(METHODS), curves.items(), strict=False):
+        for steps, returns in seeds:
+            axes.plot(steps, returns, color=color, lw=0.7, alpha=0.5)
+        label = f"{method} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
+        axes.plot(*mean_over_seeds(seeds), color=color, lw=2, marker="o", ms=3.5, label=label)
+    for style, (label, (steps, returns)) in zip(itertools.cycle((":", "-.")), published.items(), strict=False):
+        within = steps <= env_steps
+        if within.sum() > 1:
+            axes.plot(steps[within], returns[within], color="k", lw=1.2, ls=style, label=f"{label}, published")
+        else:
+            nearest = min(int(within.sum()), len(steps) - 1)
+            told = f"{label}, published, {steps[nearest]:,.0f} steps ({returns[nearest]:.3g})"
+            axes.axhline(returns[nearest], color="k", lw=1.2, ls=style, label=told)
+    if random_return is not None:
+        axes.axhline(random_return, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({random_return:.3g})")
+    axes.set(title=title, xlabel="environment steps", ylabel="evaluation return", xlim=(0, env_steps))
+    _style(axes)
+    axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _save(figure, path)
+
+
+def mean_over_seeds(seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Environment steps that every seed was evaluated at, and the mean return there."""
+    if not seeds:
+        return np.zeros(0), np.zeros(0)
+    common = functools.reduce(np.intersect1d, [steps for steps, _ in seeds])
+    return common, np.mean([returns[np.isin(steps, common)] for steps, returns in seeds], axis=0)
+
+
+def _style(axes: Axes) -> None:
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.25, lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _save(figure: Figure, path: Path) -> None:
     beside = path.with_name(path.name + ".partial")
     figure.savefig(beside, format="png")
     os.replace(beside, path)

@@ -1,0 +1,191 @@
+"""Compares methods on one task: ``python -m experiments.compare --help``.
+
+Runs what is missing of every method and seed, one after the other, each a run of `experiments.train` with a directory
+of its own, and draws all of it into one figure.
+"""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+
+from experiments.options import Name, quiet, refusing
+from ne_dreamer_jax import envs, names, run_directory
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ne_dreamer_jax.config import Config
+
+PUBLISHED = Path(__file__).parent / "reference" / "dmc_vision_published.csv"
+LABELS = {"dreamerv3": "DreamerV3", "drqv2": "DrQ-v2"}
+Curve = tuple["np.ndarray", "np.ndarray"]
+
+
+class Found(NamedTuple):
+    """A run that has been evaluated at least once."""
+
+    config: Config
+    curve: Curve  # environment steps and returns of its evaluations
+    random_return: float | None
+
+
+def command(methods: Sequence[str], help_text: str) -> click.Command:
+    """The command that compares these methods, unless told others."""
+
+    @click.command(context_settings={"max_content_width": 110}, help=help_text)
+    @click.argument("directory", type=click.Path(path_type=Path, file_okay=False))
+    @click.option("--task", type=Name("task", envs.names()), help="What to learn; default: the preset's.")
+    @click.option(
+        "--method",
+        "chosen",
+        type=Name("method", names.METHODS),
+        multiple=True,
+        help=f"May be repeated. Default: {', '.join(methods)}.",
+    )
+    @click.option("--seeds", type=click.IntRange(1), default=2, show_default=True, help="Runs of each method.")
+    @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart", show_default=True)
+    @click.option("--size", type=Name("size", names.SIZES), help="Parameters, roughly; default: the preset's.")
+    @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As for experiments.train.")
+    @click.option("--draw", "only_draw", is_flag=True, help="Train nothing; draw the runs that are there.")
+    def main(
+        directory: Path,
+        task: str | None,
+        chosen: tuple[str, ...],
+        seeds: int,
+        preset: str,
+        size: str | None,
+        assignments: tuple[str, ...],
+        only_draw: bool,
+    ) -> None:
+        quiet()
+        options = ["--preset", preset]
+        for option, value in (("--task", task), ("--size", size)):
+            options += [] if value is None else [option, value]
+        for assignment in assignments:
+            options += ["--set", assignment]
+        if not only_draw:
+            for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
+                for method in chosen or methods:
+                    path = directory / method.replace("/", "-") / f"seed{seed}"
+                    if not finished(path):
+                        click.echo(f"\n{method}, seed {seed}: {path}")
+                        train(path, [*options, "--method", method, "--seed", str(seed)])
+        with refusing(run_directory.RefusedError, ValueError):
+            found = find(directory)
+            for line in draw(found, directory / "comparison.png"):
+                click.echo(line)
+
+    return main
+
+
+def train(path: Path, options: Sequence[str]) -> None:
+    """One run, in a process of its own; ends this one where it fails or is stopped."""
+    arguments = [sys.executable, "-m", "experiments.train", *options, "--logdir", str(path)]
+    code = subprocess.run(arguments, check=False).returncode
+    if code:
+        raise SystemExit(code)
+
+
+def finished(path: Path) -> bool:
+    """Whether a run has had its last evaluation."""
+    files = run_directory.RunDirectory(path)
+    if not files.config.exists():
+        return False
+    from ne_dreamer_jax import metrics
+    from ne_dreamer_jax.config import Config
+
+    budget = run_directory.read_config(path, Config).loop.env_steps
+    return any("eval/return" in line and line["env_step"] >= budget for line in metrics.read(files.metrics))
+
+
+def find(directory: Path) -> list[Found]:
+    """All runs under a directory that were evaluated, by path.
+
+    Raises:
+      ValueError: there is none, or they are of different tasks.
+    """
+    from ne_dreamer_jax import metrics
+    from ne_dreamer_jax.config import Config
+
+    found = []
+    for marker in sorted(directory.rglob(run_directory.MARKER)):
+        files = run_directory.RunDirectory(marker.parent)
+        lines = metrics.read(files.metrics)
+        steps, returns = metrics.series(lines, "eval/return")
+        _, of_random = metrics.series(lines, "eval/random_return")
+        if len(steps):
+            config = run_directory.read_config(marker.parent, Config)
+            found.append(Found(config, (steps, returns), float(of_random[-1]) if len(of_random) else None))
+    if not found:
+        raise ValueError(f"expected runs that have been evaluated under {directory}, got none")
+    tasks = sorted({run.config.env.task for run in found})
+    if len(tasks) > 1:
+        raise ValueError(f"expected runs of one task under {directory}, got {', '.join(tasks)}")
+    return found
+
+
+def draw(found: Sequence[Found], path: Path) -> list[str]:
+    """Draws the figure; returns a table, one line a method: mean and range over seeds of the last evaluation."""
+    import numpy as np
+
+    from experiments import plots
+
+    by_method: dict[str, list[Found]] = {}
+    for run in found:
+        by_method.setdefault(run.config.method, []).append(run)
+    of_random = [run.random_return for run in found if run.random_return is not None]
+    random_return = float(np.mean(of_random)) if of_random else None
+    task = found[0].config.env.task
+    plots.comparison(
+        {method: [run.curve for run in runs] for method, runs in by_method.items()},
+        path,
+        title=task,
+        env_steps=max(run.config.loop.env_steps for run in found),
+        random_return=random_return,
+        published=published(task),
+    )
+    lines = [f"{task}: return of the last evaluation, mean over seeds (lowest to highest)"]
+    for method, runs in by_method.items():
+        last = [float(run.curve[1][-1]) for run in runs]
+        unfinished = sum(run.curve[0][-1] < run.config.loop.env_steps for run in runs)
+        note = f", {unfinished} unfinished" if unfinished else ""
+        seeds = f"{len(last)} seed{'s' * (len(last) > 1)}{note}"
+        lines.append(f"  {method:28} {np.mean(last):8.1f} ({min(last):.1f} to {max(last):.1f}), {seeds}")
+    if random_return is not None:
+        lines.append(f"  {'random policy':28} {random_return:8.1f}")
+    return [*lines, f"  {path}"]
+
+
+def published(task: str) -> Mapping[str, Curve]:
+    """Label -> published environment steps and returns on a task; empty for one that is not in the file."""
+    import numpy as np
+
+    curves: dict[str, tuple[list[float], list[float]]] = {}
+    with PUBLISHED.open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if f"dmc/{row['task']}" == task:
+                steps, returns = curves.setdefault(LABELS[row["method"]], ([], []))
+                steps.append(float(row["env_steps"]))
+                returns.append(float(row["mean_return"]))
+    return {label: (np.asarray(steps), np.asarray(returns)) for label, (steps, returns) in curves.items()}
+
+
+main = command(
+    [name for name in names.METHODS if "/" not in name],
+    """Train methods on one task with a few seeds each, and draw them together.
+
+    Each run is kept in DIRECTORY/METHOD/seedN; those that are finished are not run again, and one that was stopped goes
+    on. DIRECTORY/comparison.png shows evaluation returns, with a random policy's and, for DeepMind Control, the
+    published returns of DreamerV3 and DrQ-v2 from pixels.
+    """,
+)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Several runs in one figure: which are run, which are found, and what is said about them."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from experiments import ablations, compare, plots
+from experiments.train import configure
+from ne_dreamer_jax import metrics, names, run_directory
+from ne_dreamer_jax.metrics import Counters
+
+BUDGET = 400
+
+
+def write(path, options, upto=BUDGET):
+    """What a run leaves behind."""
+    given = dict(zip(options[::2], options[1::2], strict=True))
+    seed = int(given["--seed"])
+    values = {"seed": seed, "env.task": given.get("--task"), "loop.env_steps": BUDGET}
+    config = configure(given["--preset"], None, given["--method"], values)
+    with run_directory.claim(path, config) as files, metrics.Writer(files.metrics) as writer:
+        for step in range(100, upto + 1, 100):
+            more = {"eval/random_return": 7.0} if step == 100 else {}
+            writer.write(Counters(step, step // 2, 0), {"eval/return": step + seed, **more})
+
+
+@pytest.fixture
+def invoke(monkeypatch):
+    started = []
+
+    def train(path, options):
+        started.append((path.parent.name, path.name))
+        write(path, options)
+
+    monkeypatch.setattr(compare, "train", train)
+
+    def invoke(command, *arguments):
+        result = CliRunner().invoke(command.main, [str(argument) for argument in arguments])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result.exit_code, result.output, started
+
+    return invoke
+
+
+def test_every_method_and_seed_is_run_once(tmp_path, invoke):
+    chosen = ["--method", "r2dreamer", "--method", "ne_dreamer/no_shift"]
+    code, output, started = invoke(compare, tmp_path, *chosen, "--seeds", 2)
+    assert code == 0
+    assert started == [(m, f"seed{s}") for s in (0, 1) for m in ("r2dreamer", "ne_dreamer-no_shift")]
+    assert (tmp_path / "comparison.png").read_bytes()[1:4] == b"PNG"
+    lines = {line.split()[0]: " ".join(line.split()) for line in output.splitlines() if line.startswith("  ")}
+    for method in ("r2dreamer", "ne_dreamer/no_shift"):
+        assert lines[method] == f"{method} 400.5 (400.0 to 401.0), 2 seeds"
+    assert "random policy 7.0" in " ".join(output.split())
+    started.clear()
+    assert invoke(compare, tmp_path, *chosen, "--seeds", 2)[2] == []  # all finished
+    assert invoke(compare, tmp_path, *chosen, "--seeds", 3, "--draw")[2] == []
+
+
+def test_a_run_that_was_stopped_goes_on(tmp_path, invoke):
+    options = ["--preset", "quickstart", "--method", "r2dreamer", "--seed", "0"]
+    write(tmp_path / "r2dreamer" / "seed0", options, upto=200)
+    _, output, started = invoke(compare, tmp_path, "--draw")
+    assert started == []
+    assert "1 unfinished" in output
+    _, _, started = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
+    assert started == [("r2dreamer", "seed0")]
+
+
+def test_the_ablations_are_the_papers(tmp_path, invoke):
+    _, _, started = invoke(ablations, tmp_path, "--seeds", 1)
+    assert [name.replace("-", "/") for name, _ in started] == [n for n in names.METHODS if n.startswith("ne_dreamer")]
+
+
+def test_runs_of_different_tasks_are_refused(tmp_path, invoke):
+    invoke(compare, tmp_path / "a", "--method", "r2dreamer", "--seeds", 1, "--task", "dmc/walker_walk")
+    code, output, _ = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1, "--task", "dmc/cheetah_run")
+    assert code == 2
+    assert "expected runs of one task" in " ".join(output.split())
+    code, output, _ = invoke(compare, tmp_path / "empty", "--draw")
+    assert code == 2
+    assert "got none" in " ".join(output.split())
+
+
+def test_published_returns_are_those_of_the_file():
+    curves = compare.published("dmc/cartpole_swingup")
+    assert set(curves) == {"DreamerV3", "DrQ-v2"}
+    steps, returns = curves["DreamerV3"]
+    assert (steps[0], returns[0], len(steps)) == (50_000, 210.3, 20)
+    assert compare.published("rooms/watermaze") == {}
+
+
+def test_the_mean_is_over_the_steps_that_all_seeds_have():
+    seeds = [(np.asarray([1.0, 2, 3]), np.asarray([10.0, 20, 30])), (np.asarray([1.0, 3]), np.asarray([0.0, 10]))]
+    steps, mean = plots.mean_over_seeds(seeds)
+    np.testing.assert_array_equal(steps, [1, 3])
+    np.testing.assert_array_equal(mean, [5, 20])
+
+
+@pytest.mark.parametrize("env_steps", [30_000, 200_000])
+def test_budgets_short_and_long_are_drawn_beside_published_returns(tmp_path, env_steps):
+    curve = (np.asarray([1e4, 3e4]), np.asarray([1.0, 2.0]))
+    path = tmp_path / "x.png"
+    plots.comparison(
+        {"ne_dreamer": [curve]}, path, title="t", env_steps=env_steps, published=compare.published("dmc/walker_walk")
+    )
+    assert path.stat().st_size > 10_000
