@@ -94,6 +94,7 @@ def test_weights_of_losses_that_a_method_shares_are_kept():
         (["agent.objective.shift=0"], "ne_dreamer/no_shift"),
         (["agent.objective.shift=0", "agent.objective.predictor.layers=0"], "ne_dreamer/no_transformer+no_shift"),
         (["agent.objective=SameStep", "agent.objective.redundancy=0.1"], "r2dreamer"),
+        (["agent.objective.alignment=cosine", "agent.objective.steps=3"], "ne_dreamer/3_steps+cosine"),
         (["agent.objective=SameStep", "agent.objective=NextEmbedding"], "ne_dreamer"),
     ],
 )
@@ -174,7 +175,8 @@ def test_unknown_names_bring_the_nearest(call, message):
 # Every setting changes something.
 
 BASE = Config(
-    agent=tiny.CONFIG, loop=LoopConfig(env_steps=600, num_envs=3, replay_ratio=1.0, prefill=30, eval_every=200)
+    agent=tiny.with_objective(steps=2),
+    loop=LoopConfig(env_steps=600, num_envs=3, replay_ratio=1.0, prefill=30, eval_every=200),
 )
 
 CHANGES = {
@@ -210,6 +212,9 @@ CHANGES = {
         "predictor.positions": "9",
         "predictor.projector": "false",
         "shift": "0",
+        "steps": "3",
+        "step_discount": "0.9",
+        "alignment": "vicreg",
         "redundancy": "0.1",
         "action": "previous",
         "masked": "false",

@@ -7,6 +7,7 @@ statistics of the whole batch and return a scalar.
 """
 
 from ne_dreamer_jax.losses.actor_critic import critic_loss, dynamics_loss, reinforce_loss
+from ne_dreamer_jax.losses.alignment import cosine_alignment, vicreg
 from ne_dreamer_jax.losses.barlow import barlow_twins, next_embedding_loss
 from ne_dreamer_jax.losses.kl import balanced_kl, categorical_kl, unimix_logits
 from ne_dreamer_jax.losses.reconstruction import image_loss, vector_loss
@@ -19,6 +20,7 @@ __all__ = [
     "balanced_kl",
     "barlow_twins",
     "categorical_kl",
+    "cosine_alignment",
     "critic_loss",
     "dynamics_loss",
     "image_loss",
@@ -36,4 +38,5 @@ __all__ = [
     "unimix_logits",
     "update_percentiles",
     "vector_loss",
+    "vicreg",
 ]

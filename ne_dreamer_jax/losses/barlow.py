@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -81,6 +83,7 @@ def next_embedding_loss(
     redundancy: float = 5e-4,
     shift: int = 1,
     masked: bool = True,
+    align: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     r"""Next-embedding predictive alignment, :math:`L_{NE}`: `barlow_twins` between predictions and later embeddings.
 
@@ -100,9 +103,10 @@ def next_embedding_loss(
       redundancy: :math:`\lambda_{BT}`.
       shift: k >= 0. 1 is the paper's loss; 0 its ablation "w/o shift", where every step counts.
       masked: False counts every pair, also those across two episodes, as the authors' released code does.
+      align: (prediction, target, mask) -> loss and metrics, in place of `barlow_twins`; such as `cosine_alignment`.
 
     Returns:
-      As `barlow_twins`.
+      As `barlow_twins`, or as ``align``.
 
     Raises:
       ValueError: where the shapes do not agree, or where ``shift`` leaves no pair in T steps.
@@ -121,4 +125,6 @@ def next_embedding_loss(
         episode = jnp.cumsum(is_first.astype(jnp.int32), axis=1)  # the same number on all steps of an episode
         mask = episode[:, : length - shift] == episode[:, shift:]
     target = jax.lax.stop_gradient(embedding[:, shift:])
+    if align is not None:
+        return align(predicted[:, : length - shift], target, mask)
     return barlow_twins(predicted[:, : length - shift], target, mask, redundancy)

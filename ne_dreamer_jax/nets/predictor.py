@@ -97,10 +97,11 @@ class Predictor(nn.Module):
     discrete: bool
     across_episodes: bool = False
     dtype: Any = jnp.float32
+    steps: int = 1  # K, how many embeddings are predicted at each step
 
     @nn.compact
     def __call__(self, feature: Array, action: Array, is_first: Array) -> Array:
-        """``feature`` [B, T, F], ``action`` [B, T, A] and ``is_first`` [B, T] to float32 [B, T, E].
+        """``feature`` [B, T, F], ``action`` [B, T, A] and ``is_first`` [B, T] to float32 [B, T, K * E].
 
         Raises ValueError where T exceeds the learned positions.
         """
@@ -116,7 +117,7 @@ class Predictor(nn.Module):
             act = nn.gelu(LayerNorm(dtype, name="action_norm")(act), approximate=False)
         x = state + act if c.layers == 0 else self._attend(state, act, is_first)
         x = Linear(c.width, dtype=dtype, name="hidden")(LayerNorm(dtype, name="out_norm")(x))
-        x = Linear(self.embedding, dtype=dtype, name="out")(nn.gelu(x, approximate=False))
+        x = Linear(self.steps * self.embedding, dtype=dtype, name="out")(nn.gelu(x, approximate=False))
         return x.astype(jnp.float32)
 
     def _attend(self, state: Array, act: Array, is_first: Array) -> Array:

@@ -8,10 +8,13 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from ne_dreamer_jax.losses import next_embedding_loss
+from ne_dreamer_jax.losses import cosine_alignment, next_embedding_loss, vicreg
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
 from ne_dreamer_jax.types import Array, DiscreteAction, Metrics, Params, Rollout
+
+ALIGNMENTS: dict[str, Any] = {"barlow_twins": None, "cosine": cosine_alignment, "vicreg": vicreg}
+"""Name -> what `next_embedding_loss` takes in place of Barlow Twins."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,12 @@ class NextEmbedding:
     """``layers=0`` is w/o transformer, ``projector=False`` w/o projector."""
     shift: int = 1
     """The embedding at t + shift is the target of the prediction at t; 0 is w/o shift."""
+    steps: int = 1
+    """K: at each step the embeddings at t + shift, ..., t + shift + K - 1 are predicted, each by outputs of its own."""
+    step_discount: float = 0.5
+    """The loss of each step further ahead weighs so much less; the weights are scaled to the sum 1."""
+    alignment: Literal["barlow_twins", "cosine", "vicreg"] = "barlow_twins"
+    """How predictions are aligned to embeddings: as in the paper, or by a loss that it names as open."""
     redundancy: float = 5e-4
     """Weight of the off-diagonal terms of Barlow Twins."""
     action: Literal["current", "previous"] = "current"
@@ -36,6 +45,13 @@ class NextEmbedding:
             raise ValueError(f"objective.action: expected 'current' or 'previous', got {self.action!r}.")
         if self.shift < 0:
             raise ValueError(f"objective.shift: expected 0 or more, got {self.shift}.")
+        if self.steps < 1 or not self.step_discount > 0:
+            raise ValueError(
+                f"objective: expected steps of 1 or more and a step_discount above 0, got {self.steps} and "
+                f"{self.step_discount}."
+            )
+        if self.alignment not in ALIGNMENTS:
+            raise ValueError(f"objective.alignment: expected one of {[*ALIGNMENTS]}, got {self.alignment!r}.")
 
     @property
     def losses(self) -> Mapping[str, float]:
@@ -44,13 +60,16 @@ class NextEmbedding:
 
     @property
     def method(self) -> str:
-        """Name of the method, with what is ablated."""
-        ablated = {
+        """Name of the method, with what is ablated or otherwise than in the paper."""
+        varied = {
             "no_transformer": self.predictor.layers == 0,
             "no_shift": self.shift == 0,
             "no_projector": not self.predictor.projector,
+            f"{self.steps}_steps": self.steps > 1,
+            self.alignment: self.alignment != "barlow_twins",
         }
-        return "/".join(["ne_dreamer", *filter(None, ["+".join(name for name, absent in ablated.items() if absent)])])
+        names = "+".join(name for name, applies in varied.items() if applies)
+        return f"ne_dreamer/{names}" if names else "ne_dreamer"
 
     def build(self, model: Model) -> Objective:
         """The objective's functions.
@@ -61,10 +80,17 @@ class NextEmbedding:
             raise ValueError(
                 f"objective.shift: expected less than agent.batch_length {model.length}, got {self.shift}."
             )
+        if self.shift + self.steps > model.length:
+            raise ValueError(
+                f"objective.steps: expected at most agent.batch_length {model.length} less objective.shift "
+                f"{self.shift}, got {self.steps}."
+            )
         check_length(self.predictor, model.length)
         nets, space = model.nets, model.nets.spec.action
         discrete = isinstance(space, DiscreteAction)
-        predictor = Predictor(self.predictor, nets.embedding, discrete, self.across_episodes, nets.dtype)
+        predictor = Predictor(self.predictor, nets.embedding, discrete, self.across_episodes, nets.dtype, self.steps)
+        weights = [self.step_discount**k for k in range(self.steps)]
+        align: Any = ALIGNMENTS[self.alignment]
 
         def init(key: Array) -> Params:
             feature, action = jnp.zeros((1, 1, nets.feature)), jnp.zeros((1, 1, space.size))
@@ -74,9 +100,15 @@ class NextEmbedding:
             action = rollout.action if self.action == "current" else rollout.prev_action
             is_first = rollout.batch.is_first
             predicted: Any = predictor.apply({"params": params["objective"]}, rollout.feature, action, is_first)
-            value, metrics = next_embedding_loss(
-                predicted, rollout.embedding, is_first, self.redundancy, self.shift, self.masked
-            )
-            return {"next_embedding": value}, {f"next_embedding/{name}": x for name, x in metrics.items()}
+            total = jnp.zeros(())
+            metrics: Metrics = {}
+            for k, (weight, ahead) in enumerate(zip(weights, jnp.split(predicted, self.steps, axis=-1), strict=True)):
+                value, details = next_embedding_loss(
+                    ahead, rollout.embedding, is_first, self.redundancy, self.shift + k, self.masked, align
+                )
+                total = total + weight / sum(weights) * value
+                prefix = f"next_embedding/{k + 1}_" if k else "next_embedding/"
+                metrics |= {prefix + name: x for name, x in details.items()}
+            return {"next_embedding": total}, metrics
 
         return Objective(init, no_target, loss, keep_target)

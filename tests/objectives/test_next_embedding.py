@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from ne_dreamer_jax.losses import next_embedding_loss
+from ne_dreamer_jax.losses import cosine_alignment, next_embedding_loss, vicreg
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig
 from ne_dreamer_jax.objectives import Model, NextEmbedding
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, EnvSpec, Rollout
@@ -72,6 +72,30 @@ def test_the_loss_is_of_the_predictor_and_the_settings(changes):
     )
     np.testing.assert_allclose(losses["next_embedding"], want, rtol=1e-5)
     assert set(metrics) == {f"next_embedding/{name}" for name in details}
+
+
+@pytest.mark.parametrize("alignment", ["barlow_twins", "cosine", "vicreg"])
+def test_steps_further_ahead_have_outputs_of_their_own_and_weigh_less(alignment):
+    config, objective, params = make(steps=3, step_discount=0.5, alignment=alignment)
+    rollout = noise()
+    losses, metrics = jax.jit(objective.loss)(params, {}, jax.random.key(0), rollout)
+    assert params["objective"]["out"]["kernel"].shape == (16, 3 * E)
+    predictor = Predictor(config.predictor, E, False, False, jnp.float32, 3)
+    predicted = predictor.apply(
+        {"params": params["objective"]}, rollout.feature, rollout.action, rollout.batch.is_first
+    )
+    align = {"barlow_twins": None, "cosine": cosine_alignment, "vicreg": vicreg}[alignment]
+    each = [
+        next_embedding_loss(
+            predicted[..., k * E : (k + 1) * E], rollout.embedding, rollout.batch.is_first, shift=1 + k, align=align
+        )
+        for k in range(3)
+    ]
+    want = sum(weight * value for weight, (value, _) in zip((4 / 7, 2 / 7, 1 / 7), each, strict=True))
+    np.testing.assert_allclose(losses["next_embedding"], want, rtol=1e-4)
+    assert each[0][1]["pairs"] > each[2][1]["pairs"]
+    for prefix, (_, details) in zip(("", "2_", "3_"), each, strict=True):
+        np.testing.assert_array_equal(metrics[f"next_embedding/{prefix}pairs"], details["pairs"])
 
 
 def test_there_are_no_target_parameters():
@@ -145,6 +169,8 @@ def test_what_follows_from_the_action_is_learned_from_it_and_not_from_the_one_be
     ("changes", "message"),
     [
         ({"action": "next"}, "objective.action: expected 'current' or 'previous', got 'next'"),
+        ({"alignment": "l2"}, "objective.alignment: expected one of .*, got 'l2'"),
+        ({"steps": 0}, "expected steps of 1 or more and a step_discount above 0, got 0"),
         ({"shift": -1}, "objective.shift: expected 0 or more, got -1"),
     ],
 )
@@ -156,6 +182,7 @@ def test_settings_out_of_range_are_refused(changes, message):
 @pytest.mark.parametrize(
     ("changes", "length", "message"),
     [
+        ({"shift": 2, "steps": 5}, 6, "objective.steps: expected at most agent.batch_length 6 .* 2, got 5"),
         ({"shift": 6}, 6, "objective.shift: expected less than agent.batch_length 6, got 6"),
         ({}, 9, "Sequences of 9 steps, but the predictor has positions for 8"),
     ],
