@@ -23,6 +23,8 @@ METHODS = tuple(name for name in names.METHODS if "/" not in name)
 def main(sizes: tuple[str, ...], methods: tuple[str, ...], actions: int, rounds: int, counts: bool) -> None:
     """Time an update of 16 sequences of 64 frames of 64x64x3 pixels, method by method in turns.
 
+    drqv2's is of transitions of 84x84x3 pixels, as published (walker tasks: 512 of them).
+
     Beside the times stand the parameters by module (and those that no gradient trains, such as a teacher's) and the
     bytes that the compiled update needs besides its arguments.
     """
@@ -31,7 +33,7 @@ def main(sizes: tuple[str, ...], methods: tuple[str, ...], actions: int, rounds:
         with refusing(ValueError):
             made = {method: _make(size, method, actions) for method in methods or METHODS}
         if counts:
-            print(f"parameters at {size}, {actions} continuous actions, 64x64x3 pixels")
+            print(f"parameters at {size}, {actions} continuous actions")
             print(common.table([{"method": name, **parameters(agent)} for name, agent in made.items()]))
             continue
         cases, columns = {}, {}
@@ -62,8 +64,10 @@ def _make(size: str, method: str, actions: int) -> Any:
     from ne_dreamer_jax.agent import make_agent
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
-    spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(actions))
-    return make_agent(configure("dmc", size, method, {}).agent, spec)
+    config = configure("dmc", size, method, {})
+    side = config.env.image_size
+    spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
+    return make_agent(config.agent, spec)
 
 
 def _update(agent: Any) -> tuple[Callable[[], Any], int]:

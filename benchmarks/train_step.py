@@ -26,15 +26,16 @@ from ne_dreamer_jax import names
 @click.option("--parts/--no-parts", default=True, show_default=True, help="Whether to time the parts too.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
 def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignments: tuple[str, ...]) -> None:
-    """Time the 64x64x3 update of a size, in seconds and in GEMM units."""
+    """Time the update of a size on 64x64x3 frames (drqv2: 84x84x3), in seconds and in GEMM units."""
     quiet()
     from ne_dreamer_jax import replay
-    from ne_dreamer_jax.agent import make_agent, parameter_counts
+    from ne_dreamer_jax.agent import AgentConfig, make_agent, parameter_counts
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     with refusing(ValueError):
-        config = configure(size, method, assignments)
-        spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(actions))
+        run = configure(size, method, assignments)
+        config, side = run.agent, run.env.image_size
+        spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
         agent = make_agent(config, spec)
     state = agent.init(jax.random.key(0))
     batch = jax.jit(lambda key: replay.random_batch(spec, config, key))(jax.random.key(1))
@@ -42,7 +43,7 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
     jitted: Any = agent.train_step
     temporary = jitted.lower(state, batch).compile().memory_analysis().temp_size_in_bytes
     cases: dict[str, Callable[[], Any]] = {}
-    if parts:
+    if parts and isinstance(config, AgentConfig):
         cases |= _parts(config, spec, state, batch)
     holder = [state]  # the update donates its state
 
@@ -60,7 +61,7 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
             "method": method,
             "batch_size": config.batch_size,
             "batch_length": config.batch_length,
-            "compute_dtype": config.compute_dtype,
+            "compute_dtype": getattr(config, "compute_dtype", "float32"),
             "parameters": sum(counts.values()),
             "temporary_bytes": temporary,
             **{f"parameters_{name}": count for name, count in counts.items()},
@@ -69,10 +70,10 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
 
 
 def configure(size: str, method: str, assignments: tuple[str, ...]) -> Any:
-    """The agent's config of a size and method with settings changed. Raises ValueError as the training command does."""
+    """The config of a size and method with settings changed. Raises ValueError as the training command does."""
     from experiments.train import configure as configure_run
 
-    return configure_run("dmc", size, method, {}, assignments).agent
+    return configure_run("dmc", size, method, {}, assignments)
 
 
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:

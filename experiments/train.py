@@ -138,6 +138,8 @@ def configure(
     from ne_dreamer_jax import config as presets
 
     config = presets.preset(preset, size)
+    if (task := values.get("env.task")) is not None:  # before the method: drqv2's authors chose some settings by task
+        config = presets.override(config, f"env.task={task}")
     if method is not None:
         config = presets.with_method(config, method)
     for path, value in values.items():

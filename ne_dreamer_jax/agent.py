@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from ne_dreamer_jax import behavior, optim, shapes, world_model
+from ne_dreamer_jax import behavior, drqv2, optim, shapes, world_model
 from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.drqv2 import DrQv2Config
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
@@ -70,6 +71,11 @@ class AgentConfig:
         """Name of the method that these settings are."""
         return self.objective.method
 
+    @property
+    def latent_sizes(self) -> tuple[int, int, int]:
+        """D, S, K of the latents in replay."""
+        return (self.rssm.deter, self.rssm.stoch, self.rssm.classes)
+
 
 class Agent(NamedTuple):
     """Pure functions. N environments act together; a batch has B sequences of T steps."""
@@ -88,7 +94,17 @@ class Agent(NamedTuple):
     spec: EnvSpec
 
 
-def make_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
+def make_agent(config: AgentConfig | DrQv2Config, spec: EnvSpec) -> Agent:
+    """The agent of ``config`` for environments of ``spec``: what kind is said by the config's type.
+
+    Raises ValueError where the config and the environment do not fit.
+    """
+    if isinstance(config, DrQv2Config):
+        return Agent(*drqv2.build(config, spec), config, spec)
+    return make_world_model_agent(config, spec)
+
+
+def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     """The world-model agent of ``config`` for environments of ``spec``.
 
     Raises ValueError where the config and the environment do not fit: observations that no encoder takes, loss scales

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from ne_dreamer_jax import settings
+from ne_dreamer_jax import drqv2, settings
 from ne_dreamer_jax.agent import AgentConfig
 from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.drqv2 import DrQv2Config
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
@@ -53,7 +54,7 @@ class Config:
     """An experiment."""
 
     env: EnvConfig = field(default_factory=EnvConfig)
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent: AgentConfig | DrQv2Config = field(default_factory=AgentConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     seed: int = 0
 
@@ -148,22 +149,56 @@ def with_method(config: Config, method: str) -> Config:
     """The config with another of the paper's methods; what the methods share stays as the config has it.
 
     The weights of the method's own losses are its authors', unless the config weighs losses of these names already.
+
+    ``drqv2`` shares the environment and the budget: it is as its authors have it for the task, at their image size
+    where the config has the paper's. It learns as often for each agent step as the config's agent (in the paper's
+    setting every second step, as published), and from no more steps at once, nor begins later, than that.
+
+    Raises:
+      ValueError: an unknown method, or a world-model method for a config that has no world model to begin with.
     """
-    _check("method", method, METHODS)
-    return _with_objective(config, METHODS[method](config.agent.objective))
+    _check("method", method, [*METHODS, "drqv2"])
+    if method == config.method:
+        return config
+    if isinstance(config.agent, DrQv2Config):
+        raise ValueError(f"expected a config of a world-model method to make {method} of, got drqv2; take the preset's")
+    if method == "drqv2":
+        return _drqv2(config, config.agent)
+    return _with_objective(config, config.agent, METHODS[method](config.agent.objective))
 
 
 def override(config: Config, assignment: str) -> Config:
     """`settings.override`; another objective (``agent.objective=SameStep``) brings the weights of its losses along."""
     changed = settings.override(config, assignment)
-    other = type(changed.agent.objective) is not type(config.agent.objective)
-    return _with_objective(config, changed.agent.objective) if other else changed
+    old, new = config.agent, changed.agent
+    if isinstance(old, DrQv2Config) or isinstance(new, DrQv2Config) or type(old.objective) is type(new.objective):
+        return changed
+    return _with_objective(config, old, new.objective)
 
 
-def _with_objective(config: Config, objective: AnyObjective) -> Config:
-    old, new = config.agent.objective.losses, objective.losses
-    kept = {name: scale for name, scale in config.agent.loss_scales.items() if name not in old or name in new}
-    return replace(config, agent=replace(config.agent, objective=objective, loss_scales={**new, **kept}))
+def _with_objective(config: Config, agent: AgentConfig, objective: AnyObjective) -> Config:
+    old, new = agent.objective.losses, objective.losses
+    kept = {name: scale for name, scale in agent.loss_scales.items() if name not in old or name in new}
+    return replace(config, agent=replace(agent, objective=objective, loss_scales={**new, **kept}))
+
+
+def _drqv2(config: Config, shared: AgentConfig) -> Config:
+    published, env, loop = drqv2.for_task(config.env.task), config.env, config.loop
+    steps_per_update = shared.batch_size * shared.batch_length / loop.replay_ratio
+    agent = replace(
+        published,
+        batch_size=min(published.batch_size, shared.batch_size * shared.batch_length),
+        steps_per_update=steps_per_update,
+        random_steps=min(loop.prefill, drqv2.SEED_FRAMES // env.action_repeat),
+    )
+    image_size = drqv2.IMAGE_SIZE if env.image_size == EnvConfig.image_size else env.image_size
+    loop = replace(
+        loop,
+        replay_ratio=agent.batch_size * agent.batch_length / steps_per_update,
+        prefill=agent.random_steps,
+        write_latents=False,
+    )
+    return replace(config, env=replace(env, image_size=image_size), agent=agent, loop=loop)
 
 
 def _next_embedding(objective: AnyObjective, **predictor: Any) -> NextEmbedding:
@@ -182,4 +217,4 @@ METHODS: dict[str, Callable[[AnyObjective], AnyObjective]] = {
     "dreamerpro": lambda objective: DreamerPro(),
     "dreamer_no_reconstruction": lambda objective: NoObjective(),
 }
-"""Method -> its objective, made from that of a config."""
+"""World-model method -> its objective, made from that of a config. (``drqv2`` has none.)"""

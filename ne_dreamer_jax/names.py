@@ -12,6 +12,7 @@ METHODS = (
     "r2dreamer",
     "dreamerpro",
     "dreamer_no_reconstruction",
+    "drqv2",
 )
 PRESETS = ("dmc", "released_code", "quickstart", "smoke")
 SIZES = ("1m", "12m", "25m", "50m", "100m", "200m", "400m")

@@ -219,7 +219,7 @@ def random_batch(
 
     Args:
       spec: of the environment.
-      config: of the agent (``AgentConfig``): ``batch_size``, ``batch_length`` and the sizes in ``rssm`` are read.
+      config: of the agent: ``batch_size``, ``batch_length`` and ``latent_sizes`` are read.
       key: consumed.
       batch_size: B, in place of the config's.
       length: T, likewise.
@@ -229,7 +229,7 @@ def random_batch(
     """
     batch = config.batch_size if batch_size is None else batch_size
     steps = config.batch_length if length is None else length
-    rssm = config.rssm
+    deter_size, stoch_size, class_count = config.latent_sizes
     obs_key, action_key, reward_key, end_key, deter_key, stoch_key = jax.random.split(key, 6)
 
     def observation(name: str, key: Array) -> Array:
@@ -248,7 +248,7 @@ def random_batch(
         action = jax.random.randint(action_key, shape, 0, spec.action.size)
     end = jax.random.uniform(end_key, (batch, steps + 1))  # half of the ends are terminal
     is_last, is_terminal = end < 0.02, end < 0.01
-    classes = jax.random.randint(stoch_key, (batch, rssm.stoch), 0, rssm.classes)
+    classes = jax.random.randint(stoch_key, (batch, stoch_size), 0, class_count)
     return Batch(
         obs={name: observation(name, k) for name, k in zip(spec.observation, obs_keys, strict=True)},
         action=action[:, 1:],
@@ -258,7 +258,7 @@ def random_batch(
         is_last=is_last[:, 1:],
         is_terminal=is_terminal[:, 1:],
         context=Latent(
-            jax.random.uniform(deter_key, (batch, rssm.deter), minval=-1.0), jax.nn.one_hot(classes, rssm.classes)
+            jax.random.uniform(deter_key, (batch, deter_size), minval=-1.0), jax.nn.one_hot(classes, class_count)
         ),
         index=jnp.arange(batch * steps, dtype=jnp.int32).reshape(batch, steps),
     )

@@ -42,7 +42,7 @@ def override(config: T, assignment: str) -> T:
       config: a frozen dataclass.
       assignment: ``path=value``: field names joined with dots, and the value as its annotation reads it: ``true`` or
         ``false``, a number (an integer may be written 5e6), ``none``, members of a tuple joined with commas, or the
-        class name of a dataclass, which is then made with its defaults.
+        class name of a dataclass, which is then made with its defaults, unless it stands there already.
 
     Raises:
       ValueError: no such field, or a value that does not fit it, with what was expected and what was got.
@@ -146,6 +146,8 @@ def _walk(value: Any, annotation: Any, path: str) -> Iterable[tuple[str, Any]]:
 
 def _replace(value: Any, annotation: Any, names: list[str], text: str, done: list[str], root: Any) -> Any:
     if not names:
+        if dataclasses.is_dataclass(value) and text == type(value).__name__:
+            return value
         return _parse(annotation, text, ".".join(done))
     name, rest = names[0], names[1:]
     if dataclasses.is_dataclass(value):

@@ -9,24 +9,26 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from experiments import training
 from experiments.schedule import Schedule
 from ne_dreamer_jax import config as configs
+from ne_dreamer_jax import drqv2, envs, make_agent, names, objectives, optim, replay, settings, world_model
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax import make_agent, names, objectives, optim, replay, settings, world_model
 from ne_dreamer_jax.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.behavior import actor_critic_losses
 from ne_dreamer_jax.config import Config, EnvConfig
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
-from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout
+from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout, TimeStep
 from tests import counting, tiny
+from tests.drqv2 import small
 from tests.tiny import program
 
 KEY = jax.random.key(0)
 
 
 def test_commands_know_the_names_without_loading_the_registries():
-    assert tuple(configs.METHODS) == names.METHODS
+    assert (*configs.METHODS, "drqv2") == names.METHODS
     assert tuple(configs.PRESETS) == names.PRESETS
     assert tuple(configs.SIZES) == names.SIZES
     assert typing.get_args(typing.get_type_hints(EnvConfig)["obs"]) == names.OBSERVATIONS
@@ -60,7 +62,7 @@ def test_ablations_are_values_of_the_objective(method):
     assert changed == ablation[method]
 
 
-@pytest.mark.parametrize("method", names.METHODS)
+@pytest.mark.parametrize("method", configs.METHODS)
 def test_methods_differ_in_the_objective_and_the_weights_of_its_losses(method):
     base = configs.preset("dmc")
     config = configs.with_method(base, method)
@@ -70,7 +72,7 @@ def test_methods_differ_in_the_objective_and_the_weights_of_its_losses(method):
     assert settings.from_dict(Config, stored) == config
     assert config.agent.loss_scales == {**BASE_LOSS_SCALES, **config.agent.objective.losses}
     assert replace(config.agent, objective=None, loss_scales={}) == replace(base.agent, objective=None, loss_scales={})
-    for other in names.METHODS:  # by whatever way
+    for other in configs.METHODS:  # by whatever way
         assert (
             configs.with_method(configs.with_method(base, other), method).agent.loss_scales == config.agent.loss_scales
         )
@@ -104,6 +106,35 @@ def test_the_name_of_the_method_follows_the_settings(assignments, method):
         config = configs.override(config, assignment)
     assert config.method == method
     make_agent(config.agent, tiny.VECTORS)
+
+
+def test_drqv2_is_as_published_on_the_papers_budget():
+    """In the paper's setting the world models learn every second agent step, as DrQ-v2 does."""
+    config = configs.with_method(configs.preset("dmc"), "drqv2")
+    assert config.method == "drqv2"
+    assert config.agent == drqv2.for_task("dmc/walker_walk")
+    assert (config.env.image_size, config.env.action_repeat, config.loop.prefill) == (84, 2, 2_000)
+    assert (config.loop.replay_ratio, config.loop.write_latents) == (512 * 4 / 2, False)
+    stored = json.loads(json.dumps(settings.to_dict(config)))
+    assert stored["agent"]["type"] == "DrQv2Config"
+    assert settings.from_dict(Config, stored) == config
+    assert configs.override(config, "agent.features=10").agent.features == 10
+    assert configs.with_method(config, "drqv2") == config
+    with pytest.raises(ValueError, match="expected a config of a world-model method to make ne_dreamer of"):
+        configs.with_method(config, "ne_dreamer")
+    hard = configs.with_method(configs.override(configs.preset("dmc"), "env.task=dmc/cheetah_run"), "drqv2")
+    assert (hard.agent.noise_steps, hard.agent.n_step, hard.loop.replay_ratio) == (500_000, 3, 256 * 6 / 2)
+
+
+@pytest.mark.parametrize("name", names.PRESETS)
+def test_drqv2_keeps_the_number_of_updates_of_a_preset(name):
+    preset = configs.preset(name)
+    config = configs.with_method(preset, "drqv2")
+    updates = [c.loop.replay_ratio / (c.agent.batch_size * c.agent.batch_length) for c in (preset, config)]
+    assert updates[1] == pytest.approx(updates[0])
+    assert config.agent.steps_per_update == pytest.approx(1 / updates[1])
+    assert config.agent.random_steps == config.loop.prefill <= preset.loop.prefill
+    make_agent(config.agent, EnvSpec({"image": ArraySpec((84, 84, 3), jnp.uint8)}, ContinuousAction(2)))
 
 
 @pytest.mark.parametrize("name", names.PRESETS)
@@ -425,3 +456,66 @@ def test_every_setting_changes_something(group):
         if all(text == before(i) for i, text in enumerate(PROBES[group](changed))):
             without_effect.append(name)
     assert without_effect == []
+
+
+DRQV2_CHANGES = {
+    "frame_stack": "2",
+    "n_step": "2",
+    "discount": "0.9",
+    "batch_size": "5",
+    "channels": "3",
+    "features": "5",
+    "units": "9",
+    "learning_rate": "1e-3",
+    "target_rate": "0.1",
+    "shift": "3",
+    "noise_first": "0.9",
+    "noise_last": "0.2",
+    "noise_steps": "1000",
+    "noise_clip": "0.2",
+    "random_steps": "11",
+    "steps_per_update": "3",
+}
+
+
+def drqv2_programs(config):
+    """The parameters, acting, and the update with its batch."""
+    agent = make_agent(config.agent, small.IMAGE)
+    state = jax.eval_shape(agent.init, KEY)
+    yield str(state)
+    batch = jax.eval_shape(lambda: replay.random_batch(small.IMAGE, config.agent, KEY))
+    yield program(agent.train_step, state, batch)
+    seen = TimeStep({"image": jnp.zeros((1, 16, 17, 3), jnp.uint8)}, jnp.zeros(1), *[jnp.zeros(1, bool)] * 3)
+    yield program(lambda params: agent.act(params, agent.init_policy(1), seen, KEY), state.params)
+
+
+def test_every_setting_of_drqv2_changes_something():
+    base = replace(BASE, agent=small.CONFIG)
+    assert set(DRQV2_CHANGES) == {field.name for field in fields(small.CONFIG)}
+    before = list(drqv2_programs(base))
+    for name, value in DRQV2_CHANGES.items():
+        changed = configs.override(base, f"agent.{name}={value}")
+        assert list(drqv2_programs(changed)) != before, name
+
+
+def test_every_setting_of_the_environment_reaches_it(monkeypatch):
+    """And the action repeat the count of environment steps, too."""
+    asked = []
+
+    def make(task, **options):
+        asked.append((task, options))
+        return counting.env(image=False)
+
+    monkeypatch.setattr(envs, "make", make)
+    changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48"}
+    assert set(changes) == {field.name for field in fields(EnvConfig)}
+    base = training.build(BASE).loop
+    for name, value in changes.items():
+        run = training.build(configs.override(BASE, f"env.{name}={value}"))
+        assert asked[-1] != asked[0], name
+        assert (run.loop.vector_steps != base.vector_steps) == (name == "action_repeat")
+
+
+def test_there_are_no_other_settings():
+    """The seed is asked for where a run is trained."""
+    assert {field.name for field in fields(Config)} == {"env", "agent", "loop", "seed"}

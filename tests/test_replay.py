@@ -331,7 +331,7 @@ def test_senseless_capacities_are_refused(capacity, envs):
         replay.init(jax.tree.map(lambda x: x[0], STEPS[0]), capacity, envs)
 
 
-AGENT = SimpleNamespace(batch_size=4, batch_length=50, rssm=SimpleNamespace(deter=6, stoch=S, classes=K))
+AGENT = SimpleNamespace(batch_size=4, batch_length=50, latent_sizes=(6, S, K))
 
 
 @pytest.mark.parametrize("action", [ContinuousAction(2), DiscreteAction(5)])

@@ -96,6 +96,13 @@ def test_options_and_settings_shape_the_configuration():
     assert config.loop.replay_ratio == configs.preset("smoke").loop.replay_ratio
 
 
+def test_drqv2_is_set_up_for_the_task():
+    """Whichever of the two is said first: its authors chose some settings by task."""
+    config = train.configure("dmc", None, "drqv2", {"env.task": "dmc/cheetah_run", "seed": 1})
+    assert (config.method, config.agent.n_step, config.agent.noise_steps) == ("drqv2", 3, 500_000)
+    assert config.loop.replay_ratio == 256 * 6 / 2
+
+
 def test_every_option_names_a_setting():
     flags = {option.name for option in train.main.params} & set(train.FLAGS)
     assert flags == set(train.FLAGS)
@@ -110,7 +117,7 @@ def test_help_names_every_preset_method_size_and_task():
 
 def test_light_names_are_those_of_the_configuration():
     assert set(names.PRESETS) == set(configs.PRESETS)
-    assert set(names.METHODS) == set(configs.METHODS)
+    assert set(names.METHODS) == {*configs.METHODS, "drqv2"}
     assert set(names.SIZES) == set(configs.SIZES)
 
 
