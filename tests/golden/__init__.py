@@ -1,0 +1,1 @@
+"""Golden runs: what the first updates of every method came to, on a replay that never changes."""
