@@ -139,10 +139,19 @@ def error(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     return errors.reshape(len(errors), -1).max(-1)
 
 
-def one_step_errors(player: Player, recording: Recording) -> tuple[np.ndarray, Arrays]:
-    """Errors of reward [K] and of each observation [K], each step started from dm_control's state."""
-    rewards, obs = player.play(recording.start, recording.episode, recording.action[None])
-    return error(rewards[0], recording.reward), {key: error(obs[key][0], recording.obs[key]) for key in recording.obs}
+def one_step_errors(player: Player, recording: Recording, batch: int | None = None) -> tuple[np.ndarray, Arrays]:
+    """Errors of reward [K] and of each observation [K], each step started from dm_control's state.
+
+    Args:
+      batch: how many steps are played together, where that isn't all; what is compiled depends on it.
+    """
+    batch = batch or len(recording.reward)
+    parts = []
+    for begin in range(0, len(recording.reward), batch):
+        part = jax.tree.map(lambda x, begin=begin: x[begin : begin + batch], recording)
+        parts.append(jax.tree.map(lambda x: x[0], player.play(part.start, part.episode, part.action[None])))
+    reward, obs = jax.tree.map(lambda *values: np.concatenate(values), *parts)
+    return error(reward, recording.reward), {key: error(obs[key], recording.obs[key]) for key in recording.obs}
 
 
 def free_run(name: str, player: Player, num_steps: int, num_runs: int, tolerance: float = 1e-3) -> np.ndarray:
@@ -197,13 +206,13 @@ def our_returns(name: str, num_episodes: int, seed: int = 0) -> np.ndarray:
 
     def episode(key: jax.Array) -> jax.Array:
         reset_key, action_key = jax.random.split(key)
-        state, _ = env.reset(reset_key)
+        state = env.prepare(reset_key)  # the first step begins the episode
 
         def step(state: base.EnvState, key: jax.Array) -> tuple[base.EnvState, tuple[jax.Array, jax.Array]]:
             state, timestep = env.step(state, jax.random.uniform(key, env.spec.action.shape, jnp.float32, -1.0, 1.0))
             return state, (timestep.reward, timestep.is_last)
 
-        _, (rewards, is_last) = jax.lax.scan(step, state, jax.random.split(action_key, num_steps))
+        _, (rewards, is_last) = jax.lax.scan(step, state, jax.random.split(action_key, 1 + num_steps))
         return jnp.where(is_last[-1] & ~is_last[:-1].any(), rewards.sum(), jnp.nan)
 
     returns = np.asarray(jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(seed), num_episodes)))
@@ -246,9 +255,10 @@ class Row(NamedTuple):
 def measure(name: str, steps: int, free_steps: int, runs: int, resets: int, episodes: int) -> Row:
     """All of one task; a size of 0 skips that column."""
     task = load_task(name)
-    reward_errors, obs_errors = one_step_errors(Player(task), record(name, steps))
+    player = Player(task)  # compiles its physics once, for batches of as many as there are free runs
+    reward_errors, obs_errors = one_step_errors(player, record(name, steps), runs or None)
     worst = max(obs_errors, key=lambda key: obs_errors[key].max())
-    agreement = int(np.median(free_run(name, Player(task), free_steps, runs))) if free_steps and runs else None
+    agreement = int(np.median(free_run(name, player, free_steps, runs))) if free_steps and runs else None
     p_values = reset_p_values(our_resets(task, resets), their_resets(name, resets)) if resets else None
     ours = our_returns(name, episodes) if episodes else None
     theirs = their_returns(name, episodes) if episodes else None

@@ -59,7 +59,7 @@ def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int)
 
     def case() -> Any:
         if not held:
-            held.append(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))[0])
+            held.append(jax.jit(jax.vmap(env.prepare))(jax.random.split(jax.random.key(0), num_envs)))
         held[0], outputs = compiled(held[0], jax.random.key(1))
         return outputs
 

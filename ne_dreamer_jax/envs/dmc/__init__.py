@@ -1,17 +1,20 @@
 """The DeepMind Control Suite on MJX, stepped, rewarded and observed as dm_control does it.
 
-Each domain is a module whose ``load(task)`` gives a ``common.Task``; ``environment`` makes an environment of it.
+Each domain is a module whose ``load(task)`` gives a ``common.Task``; ``environment`` makes an environment of it. A task
+of one's own is a ``Task`` too: ``from_task`` makes its environment.
 """
 
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.envs.dmc import environment
 from ne_dreamer_jax.envs.dmc.common import Task
+from ne_dreamer_jax.envs.dmc.simulation import Simulation
 
-__all__ = ["Task", "load", "make"]
+__all__ = ["Simulation", "Task", "from_task", "load", "make"]
 
 _OBSERVATIONS = ("pixels", "vector", "both")
 
@@ -21,22 +24,39 @@ def load(domain: str, task: str) -> Task:
     return importlib.import_module(f"ne_dreamer_jax.envs.dmc.{domain}").load(task)
 
 
-def make(domain: str, task: str, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> base.Env:
-    """Makes a Control Suite environment. Its ``env_state.physics`` is the ``mjx.Data``.
+def make(domain: str, task: str, **options: Any) -> base.Env:
+    """Makes a Control Suite environment; options and errors as of ``from_task``.
 
     Args:
       domain, task: as the registry lists them.
-      obs: ``"pixels"``: ``image``, uint8 [image_size, image_size, 3]; ``"vector"``: dm_control's own observations
-        under their own names, float32; ``"both"``.
+    """
+    _check(**options)
+    return from_task(load(domain, task), **options)
+
+
+def from_task(task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> base.Env:
+    """Makes an environment of a task, one's own included. Its ``env_state.physics`` is the ``mjx.Data``.
+
+    Args:
+      task: its ``simulation`` is ``Simulation.load("fish.xml")`` for a model of the Control Suite, or
+        ``Simulation.of(mj_model)`` for any other.
+      obs: ``"pixels"``: ``image``, uint8 [image_size, image_size, 3]; ``"vector"``: the task's own observations
+        (dm_control's, under its names), float32; ``"both"``.
       action_repeat: control steps per step; their rewards are added up.
       image_size: height and width of the image in pixels.
 
     Raises:
-      ValueError: an option has a bad value.
+      ValueError: an option has a bad value, an actuator has no range, or the picture needs what the renderer does
+        not draw (the message names it).
     """
+    _check(obs=obs, action_repeat=action_repeat, image_size=image_size)
+    return base.from_core(environment.make_core(task, obs, action_repeat, image_size))
+
+
+def _check(obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> None:
+    """Raises ValueError for bad options, before a model is loaded."""
     if obs not in _OBSERVATIONS:
         raise ValueError(f"expected obs to be one of {', '.join(_OBSERVATIONS)}, got {obs!r}")
     for name, value in (("action_repeat", action_repeat), ("image_size", image_size)):
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"expected {name} to be a positive int, got {value!r}")
-    return base.from_core(environment.make_core(load(domain, task), obs, action_repeat, image_size))

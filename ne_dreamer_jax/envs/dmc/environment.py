@@ -26,8 +26,12 @@ class State(NamedTuple):
 
 
 def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core:
-    """The task as a ``Core``; arguments as in ``dmc.make``."""
+    """The task as a ``Core``; arguments and errors as in ``dmc.from_task``."""
     simulation = task.simulation
+    unlimited = simulation.mj_model.actuator_ctrlrange[:, 0] >= simulation.mj_model.actuator_ctrlrange[:, 1]
+    if unlimited.any():
+        names = [simulation.mj_model.actuator(i).name or f"number {i}" for i in unlimited.nonzero()[0]]
+        raise ValueError(f"expected a ctrlrange for each actuator, which actions are scaled to; got none for {names}")
     initial = simulation.initial()
     time_limit = math.ceil(round(task.time_limit / simulation.control_timestep, 6))  # in control steps
     low, high = simulation.mj_model.actuator_ctrlrange.astype("float32").T

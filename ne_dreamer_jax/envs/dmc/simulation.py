@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import importlib.util
 import io
@@ -10,6 +11,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 # MuJoCo looks for an OpenGL library when imported, unless told not to. Drawing here needs none.
 os.environ.setdefault("MUJOCO_GL", "disable")
@@ -89,6 +91,9 @@ class Simulation:
           filename: name of the MJCF file in the suite's directory.
           control_timestep: seconds; None: one physics step.
           edit: changes the specification in place before it is compiled.
+
+        Raises:
+          ValueError: as ``of``.
         """
         spec = mujoco.MjSpec.from_file(str(suite_directory() / filename))
         if edit is not None:
@@ -97,11 +102,35 @@ class Simulation:
             # cheetah.xml scales its masses in a way that MuJoCo discourages in new models.
             warnings.filterwarnings("ignore", message=".*settotalmass")
             mj_model = spec.compile()
+        return cls.of(mj_model, control_timestep)
+
+    @classmethod
+    def of(cls, mj_model: mujoco.MjModel, control_timestep: float | None = None) -> Simulation:
+        """The simulation of any model, such as ``mujoco.MjModel.from_xml_path`` gives.
+
+        Args:
+          mj_model: is copied.
+          control_timestep: seconds, a multiple of the model's timestep; None: one physics step.
+
+        Raises:
+          ValueError: MJX can't simulate the model as MuJoCo does (the message says what it can't), or the control
+            timestep is no multiple.
+        """
+        mj_model = copy.copy(mj_model)
+        timestep = mj_model.opt.timestep
+        n_sub_steps = 1 if control_timestep is None else round(control_timestep / timestep)
+        if n_sub_steps < 1 or abs(n_sub_steps * timestep - (control_timestep or timestep)) > 1e-9:
+            raise ValueError(f"expected control_timestep to be a multiple of {timestep:g} s, got {control_timestep}")
         mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)  # no part in the dynamics; MJX refuses it
-        if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and (mj_model.nq != mj_model.nv or mj_model.na):
-            raise ValueError(f"{filename}: RK4 is implemented for hinges, slides and stateless actuators only")
-        n_sub_steps = 1 if control_timestep is None else round(control_timestep / mj_model.opt.timestep)
-        return cls(mj_model, mjx.put_model(mj_model), n_sub_steps)
+        _refuse_what_mjx_leaves_out(mj_model)
+        try:
+            model = mjx.put_model(mj_model)
+        except NotImplementedError as error:
+            raise ValueError(f"MJX can't simulate this model: {error}") from error
+        touches = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH).any()
+        if touches and mjx.make_data(mj_model)._impl.contact.dim.size == 0:
+            raise ValueError("MJX can't simulate this model: it has touch sensors, and no two geoms that could touch")
+        return cls(mj_model, model, n_sub_steps)
 
     @property
     def control_timestep(self) -> float:
@@ -130,7 +159,7 @@ class Simulation:
     def begin(self, data: mjx.Data) -> mjx.Data:
         """Settles, and reads all sensors without any actuation, as dm_control does at the start of an episode."""
         data = self.settle(data)
-        if (self.mj_model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any():
+        if self._senses_acceleration:
             data = self._accelerate(data, passive=jnp.ones((), bool))
         return self._sense(data)
 
@@ -151,17 +180,33 @@ class Simulation:
             # In 64-bit mode MJX returns some integers wider than it takes them; a loop's carry has to keep its types.
             return jax.tree.map(lambda new, old: new.astype(old.dtype), settled, data)
 
-        def euler(_: Array, data: mjx.Data) -> mjx.Data:
+        def step(_: Array, data: mjx.Data) -> mjx.Data:
             data = self._accelerate(data, passive=restart)
             with _mjx_numerics():
-                return move(mjx.euler(self.model, data))
+                return move(integrate(self.model, data))
 
         def runge_kutta(_: Array, data: mjx.Data) -> mjx.Data:
             return _runge_kutta(data, self.mj_model.opt.timestep, lambda data: self._accelerate(data, restart), move)
 
+        def integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+            if self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+                return mjx.implicit(model, data)
+            if self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+                return mjx.euler(model, data)
+            # The sensors speak of the first stage.
+            return mjx.rungekutta4(model, data).replace(sensordata=data.sensordata)
+
+        plain = self.mj_model.nq == self.mj_model.nv and not self.mj_model.na and not self._senses_acceleration
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        sub_step = runge_kutta if rk4 else euler
-        return self._sense(jax.lax.fori_loop(0, self.n_sub_steps, sub_step, data.replace(ctrl=control)))
+        sub_steps: Any = self.n_sub_steps
+        if self._senses_acceleration and sub_steps == 1:
+            sub_steps = jnp.where(restart, 2, 1)  # the second one reads the sensors in the new state
+        sub_step = runge_kutta if rk4 and plain else step
+        return self._sense(jax.lax.fori_loop(0, sub_steps, sub_step, data.replace(ctrl=control)))
+
+    @property
+    def _senses_acceleration(self) -> bool:
+        return bool((self.mj_model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC).any())
 
     def _accelerate(self, data: mjx.Data, passive: Array) -> mjx.Data:
         """Forces, constraints and the sensors that need them; where ``passive`` without the actuators' forces."""
@@ -170,7 +215,7 @@ class Simulation:
             data = data.replace(qfrc_actuator=jnp.where(passive, 0.0, data.qfrc_actuator))
             data = mjx.fwd_acceleration(self.model, data)
             if data._impl.efc_J.size == 0:  # no constraint is possible in this model
-                return data.replace(qacc=data.qacc_smooth)
+                return mjx.sensor_acc(self.model, data.replace(qacc=data.qacc_smooth))
             return mjx.sensor_acc(self.model, mjx.solve(self.model, data))
 
     def _sense(self, data: mjx.Data) -> mjx.Data:
@@ -182,6 +227,19 @@ class Simulation:
         """Where a sensor's readings lie in ``data.sensordata``."""
         sensor = self.mj_model.sensor(name)
         return slice(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
+
+
+def _refuse_what_mjx_leaves_out(mj_model: mujoco.MjModel) -> None:
+    """Raises ValueError for what MJX passes over in silence, and so would simulate otherwise than MuJoCo."""
+    in_fluid = mj_model.opt.density > 0 or mj_model.opt.viscosity > 0
+    missing = {
+        "noslip iterations (option noslip_iterations)": mj_model.opt.noslip_iterations > 0,
+        "the ellipsoid model of fluids (geom fluidshape)": in_fluid and bool((mj_model.geom_fluid[:, 0] > 0).any()),
+        "plugins": mj_model.nplugin > 0,
+    }
+    for what, used in missing.items():
+        if used:
+            raise ValueError(f"MJX can't simulate this model: it uses {what}, which MJX lacks")
 
 
 def _runge_kutta(
