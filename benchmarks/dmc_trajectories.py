@@ -89,7 +89,7 @@ def main(out: Path) -> None:
     arrays: Arrays = {}
     for name in TASKS:
         arrays |= flat(name, record(name))
-    np.savez_compressed(out, **arrays)
+    np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
     click.echo(f"{out}: {len(TASKS)} tasks, {SEGMENTS} segments of {STEPS} agent steps, {out.stat().st_size:,} bytes")
 
 
