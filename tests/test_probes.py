@@ -121,7 +121,7 @@ class Trainer:
         _, seen = run(params, env_state, self.agent.init_policy(episodes), jax.random.key(98))
         whole = STEPS // (probe.length + 1) * (probe.length + 1)  # all episodes begin and end together
         reward, last = np.asarray(seen.reward)[:whole], np.asarray(seen.is_last)[:whole]
-        assert last.sum() == episodes * STEPS // (probe.length + 1)
+        assert last.sum() == episodes * (whole // (probe.length + 1))
         return float(reward.sum() / last.sum())
 
 
