@@ -220,18 +220,24 @@ def test_the_critics_loss_by_hand():
     assert float(critic_loss(values, jnp.zeros((3,)), jnp.zeros((3,), bool))) == 0.0
 
 
-def test_the_same_seed_gives_the_same_bits_in_one_program(quiet):
-    agent = make_agent(small.CONFIG, quiet.spec)
-    batch = small.batch(quiet.spec)
+@pytest.fixture(scope="module")
+def loud():
+    """An agent with noise and shifts, whose noise falls within a few updates."""
+    config = dataclasses.replace(small.CONFIG, random_steps=100, steps_per_update=50.0, noise_steps=1000)
+    return make_agent(config, small.BOTH)
+
+
+def test_the_same_seed_gives_the_same_bits_in_one_program(loud):
+    batch = small.batch(small.BOTH)
 
     def run(seed):
-        state = agent.init(jax.random.key(seed))
+        state = loud.init(jax.random.key(seed))
         for _ in range(3):
-            state, _, metrics = agent.train_step(state, batch)
+            state, _, metrics = loud.train_step(state, batch)
         return state, metrics
 
     assert_same(run(0), run(0))
-    assert agent.train_step._cache_size() == 1
+    assert loud.train_step._cache_size() == 1
     others = [np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(*map(leaves, (run(0), run(1))), strict=True)]
     assert any(others)
 
@@ -240,14 +246,12 @@ def leaves(run):
     return jax.tree.leaves(run[0].params["actor"])
 
 
-def test_the_noise_of_updates_follows_the_agent_steps(quiet):
-    config = dataclasses.replace(small.CONFIG, random_steps=100, steps_per_update=50.0, noise_steps=1000)
-    agent = make_agent(config, quiet.spec)
-    state = agent.init(jax.random.key(0))
+def test_the_noise_of_updates_follows_the_agent_steps(loud):
+    state = loud.init(jax.random.key(0))
     for update in (0, 6, 30):
         state = state._replace(update=jnp.asarray(update, jnp.int32))
-        state, _, metrics = agent.train_step(state, small.batch(quiet.spec))
-        want = noise(config, jnp.asarray(100 + 50 * update, jnp.int32))
+        state, _, metrics = loud.train_step(state, small.batch(small.BOTH))
+        want = noise(loud.config, jnp.asarray(100 + 50 * update, jnp.int32))
         assert float(metrics["noise"]) == pytest.approx(float(want), rel=1e-6)
 
 
