@@ -15,27 +15,38 @@ from ne_dreamer_jax import envs
 @click.option(
     "--task", "tasks", type=Name("task", envs.names()), multiple=True, default=("dmc/walker_walk",), show_default=True
 )
-@click.option("--envs", "num_envs", type=click.IntRange(1), default=16, show_default=True, help="Stepped together.")
+@click.option(
+    "--envs",
+    "counts",
+    type=click.IntRange(1),
+    multiple=True,
+    default=(16,),
+    show_default=True,
+    help="Environments stepped together. May be repeated.",
+)
 @click.option("--obs", type=click.Choice(["pixels", "vector", "both"]), default="vector", show_default=True)
 @click.option("--action-repeat", type=click.IntRange(1), default=2, show_default=True)
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Agent steps in a timed call.")
 @click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
-def main(tasks: tuple[str, ...], num_envs: int, obs: str, action_repeat: int, steps: int, rounds: int) -> None:
+def main(
+    tasks: tuple[str, ...], counts: tuple[int, ...], obs: str, action_repeat: int, steps: int, rounds: int
+) -> None:
     """Agent steps a second of each task, and what its first call, compilation included, takes."""
     quiet()
     from benchmarks import common
 
-    cases = {task: _rollout(task, num_envs, obs, action_repeat, steps) for task in dict.fromkeys(tasks)}
+    runs = {f"{task} x {n}": (task, n) for task in dict.fromkeys(tasks) for n in dict.fromkeys(counts)}
+    cases = {name: _rollout(task, n, obs, action_repeat, steps) for name, (task, n) in runs.items()}
     measured = common.measure(cases, rounds=rounds)
     columns: dict[str, dict[str, Any]] = {
-        task: {
+        name: {
             "ms_per_step": timing.median / steps * 1e3,
-            "agent_steps_per_s": num_envs * steps / timing.median,
-            "gemm_units_per_step": measured.units(task) / steps,
+            "agent_steps_per_s": runs[name][1] * steps / timing.median,
+            "gemm_units_per_step": measured.units(name) / steps,
         }
-        for task, timing in measured.cases.items()
+        for name, timing in measured.cases.items()
     }
-    settings: dict[str, Any] = {"num_envs": num_envs, "obs": obs, "action_repeat": action_repeat, "steps": steps}
+    settings: dict[str, Any] = {"obs": obs, "action_repeat": action_repeat, "steps": steps}
     common.report("rollout", measured, settings=settings, columns=columns)
 
 

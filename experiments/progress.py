@@ -24,10 +24,8 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     counts = parameter_counts(shapes.train.params)
     modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
     agent_steps = schedule.total * schedule.num_envs
-    device = jax.devices()[0]
     return [
-        f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, "
-        f"on {'the CPU' if device.platform == 'cpu' else device.device_kind}",
+        f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, on {_devices(shapes)}",
         f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
         f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
         f"  learning  {loop.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
@@ -35,6 +33,12 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
         f"  memory    replay holds {loop.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]
+
+
+def _devices(shapes: LoopState) -> str:
+    device, sharding = jax.devices()[0], getattr(shapes.key, "sharding", None)
+    kind = "the CPU" if device.platform == "cpu" else device.device_kind
+    return kind if sharding is None else f"{len(sharding.device_set)} devices ({kind})"
 
 
 class Pace:

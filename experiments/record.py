@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ne_dreamer_jax import checkpoint, metrics
+import jax
+
+from ne_dreamer_jax import checkpoint, metrics, parallel
 from ne_dreamer_jax.loop import LoopState
 from ne_dreamer_jax.metrics import Counters
 from ne_dreamer_jax.run_directory import RunDirectory
@@ -49,22 +51,23 @@ class Saves:
 
     def due(self) -> bool:
         """Whether the interval is over."""
-        return time.monotonic() - self._last >= self._seconds
+        return bool(parallel.agreed(time.monotonic() - self._last >= self._seconds)[0])
 
     def whole(self, state: LoopState, counters: Counters, score: float | None) -> None:
         """Saves everything, unless it stands there already."""
-        if not any(found.score == score for found in self._whole_at(counters)):
+        if parallel.agreed(not any(found.score == score for found in self._whole_at(counters)))[0]:
             rest: Any = ()
             self._save({"agent": state.train, "loop": state._replace(train=rest)}, counters, score)
         self._last = time.monotonic()
 
     def if_best(self, state: LoopState, counters: Counters, score: float) -> None:
         """Saves the agent if no checkpoint has a higher evaluation return."""
-        if self._whole_at(counters):  # the run was stopped here, before this evaluation
-            self.whole(state, counters, score)
-            return
         best = checkpoint.best(checkpoint.checkpoints(self._directory))
-        if best is None or best.score is None or score >= best.score:
+        beaten = best is None or best.score is None or score >= best.score
+        stopped_here, saves = parallel.agreed(bool(self._whole_at(counters)), beaten)
+        if stopped_here:  # before this evaluation
+            self.whole(state, counters, score)
+        elif saves:
             self._save({"agent": state.train}, counters, score)
 
     def _whole_at(self, counters: Counters) -> list[checkpoint.Checkpoint]:
@@ -73,6 +76,10 @@ class Saves:
 
     def _save(self, items: dict[str, Any], counters: Counters, score: float | None) -> None:
         began = time.monotonic()
+        if jax.process_count() > 1:
+            items = parallel.gather(items)
+            if jax.process_index() > 0:
+                return
         checkpoint.save(self._directory, counters.env_step, items, score=score, notes=counters._asdict())
         checkpoint.prune(self._directory, whole=WHOLE)
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

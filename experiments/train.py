@@ -5,6 +5,8 @@ Names are checked here, before JAX loads; `experiments.training` does the work.
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,6 +75,22 @@ FLAGS = {  # option -> the setting that it changes
     show_default="15",
     help="Time between checkpoints; there is one at the end and on Ctrl-C besides.",
 )
+@click.option(
+    "--devices",
+    type=click.IntRange(1),
+    metavar="N",
+    default=1,
+    show_default=True,
+    help="Devices of this process to divide environments, replay and batches over; the run is the same on any number.",
+)
+@click.option("--coordinator", metavar="HOST:PORT", help="With several processes: where the first of them listens.")
+@click.option("--processes", type=click.IntRange(1), metavar="N", default=1, help="How many processes train together.")
+@click.option("--process", type=click.IntRange(0), metavar="N", default=0, help="Which of them this is, from 0.")
+@click.option(
+    "--deterministic",
+    is_flag=True,
+    help="Repeat to the bit on GPUs too, for some speed; a CPU always does.",
+)
 @click.option("--settings", "show", is_flag=True, help="Print all settings as PATH=VALUE and exit.")
 def main(
     preset: str,
@@ -81,10 +99,15 @@ def main(
     assignments: tuple[str, ...],
     logdir: Path | None,
     checkpoint_minutes: float,
+    devices: int,
+    coordinator: str | None,
+    processes: int,
+    process: int,
+    deterministic: bool,
     show: bool,
     **flags: Any,
 ) -> None:
-    """Train an agent on one device: environments, rendering, replay and learning together.
+    """Train an agent on the device: environments, rendering, replay and learning together.
 
     \b
     The directory of the run then holds
@@ -102,7 +125,15 @@ def main(
             raise click.UsageError("Missing option '--logdir': where the run is kept, such as runs/first")
         with refusing(run_directory.RefusedError):
             run_directory.check(logdir)
+    if (processes > 1) != (coordinator is not None) or process >= processes:
+        raise click.UsageError(
+            "expected --coordinator, --processes and --process together, the last below the number of processes, got "
+            f"--coordinator {coordinator} --processes {processes} --process {process}"
+        )
     quiet()
+    if deterministic:
+        flags_of_xla = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = f"{flags_of_xla} --xla_gpu_deterministic_ops=true".strip()
     with refusing(ValueError):
         config = configure(preset, size, method, {FLAGS[name]: value for name, value in flags.items()}, assignments)
     if show or logdir is None:
@@ -110,16 +141,23 @@ def main(
             click.echo(f"{path}={settings.as_text(value)}")
         return
     from experiments import progress, training
-    from ne_dreamer_jax import checkpoint, compile_cache
+    from ne_dreamer_jax import checkpoint, compile_cache, parallel
 
+    echo = click.echo if process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
         run_directory.check_same(logdir, config)
+        if coordinator is not None:
+            parallel.connect(coordinator, processes, process)
         kept = compile_cache.enable()
-        run = training.build(config)
+        mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
+        run = training.build(config, mesh=mesh)
     for line in [*progress.describe(config, run.loop, run.shapes), f"  compiled programs are kept in {kept}"]:
-        click.echo(line)
-    with refusing(run_directory.RefusedError, checkpoint.DamagedError), run_directory.claim(logdir, config) as files:
-        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=click.echo)
+        echo(line)
+    with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:
+        files = run_directory.RunDirectory(logdir)
+        if process == 0:
+            files = stack.enter_context(run_directory.claim(logdir, config))
+        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo)
     raise SystemExit(code)
 
 

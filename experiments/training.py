@@ -7,20 +7,23 @@ checkpoints were written.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 import ne_dreamer_jax as nedreamer
 from experiments import plots, progress, video
 from experiments.record import WHOLE, Record, Saves
 from experiments.schedule import Schedule
 from experiments.stop import Stop
-from ne_dreamer_jax import checkpoint, compile_cache, metrics
+from ne_dreamer_jax import checkpoint, compile_cache, metrics, parallel
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.agent import Agent, parameter_counts
 from ne_dreamer_jax.config import Config
@@ -42,11 +45,12 @@ class Run(NamedTuple):
     shapes: LoopState  # shapes and dtypes of the whole state
 
 
-def build(config: Config, env: Env | None = None) -> Run:
+def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> Run:
     """Makes the environment, the agent and the loop of a configuration; allocates nothing.
 
     Args:
       env: what to train in, instead of the environment that the configuration names.
+      mesh: of `ne_dreamer_jax.parallel`, to train on several devices.
 
     Raises:
       ValueError: what does not fit together, or not into memory.
@@ -56,15 +60,18 @@ def build(config: Config, env: Env | None = None) -> Run:
         options.task, obs=options.obs, action_repeat=options.action_repeat, image_size=options.image_size
     )
     agent = nedreamer.make_agent(config.agent, env.spec)
-    loop = loops.make(config.loop, env, agent, options.action_repeat)
-    return Run(config, agent, loop, jax.eval_shape(loop.init, jax.random.key(0)))
+    loop = loops.make(config.loop, env, agent, options.action_repeat, mesh)
+    return Run(config, agent, loop, loop.shapes())
 
 
 def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
     """Trains to the end of the budget, from the newest checkpoint if there is one.
 
+    Where a run has several processes, all of them call this. The first alone writes files, and what hangs on a clock, a
+    signal or a file is decided there.
+
     Args:
-      files: of a directory that is claimed for this configuration.
+      files: of a directory that is claimed for this configuration; all processes must see the same.
       checkpoint_minutes: time between checkpoints.
       echo: takes the lines for people.
 
@@ -80,23 +87,30 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     counters = schedule.counters(state)
     pace = progress.Pace(schedule)
     saves = Saves(files, 60 * checkpoint_minutes, echo)
-    chunk, frames = None, None
-    with metrics.Writer(files.metrics) as writer, Stop(echo) as stop:
+    chunk: Any = None
+    frames = None
+    first = jax.process_index() == 0
+    with metrics.Writer(files.metrics if first else Path(os.devnull)) as writer, Stop(echo) as stop:
         record = Record(writer, lines)
         while True:
             step = counters.agent_step // schedule.num_envs
-            if schedule.evaluates(step) and record.find("eval/return", counters) is None:
-                values, frames = evaluate(run, state, evaluation_key, record.random_return is None, echo)
+            missing, with_random = parallel.agreed(
+                record.find("eval/return", counters) is None, record.random_return is None
+            )
+            if schedule.evaluates(step) and missing:
+                values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
-                draw(run, files, record)
+                if first:
+                    draw(run, files, record)
                 if step < schedule.total:  # at the end everything is saved below
                     saves.if_best(state, counters, values["eval/return"])
-            if step == schedule.total or stop.signal is not None:
+            (stopped_by,) = parallel.agreed(stop.signal or 0)
+            if step == schedule.total or stopped_by:
                 break
             if chunk is None:
                 chunk = _compile(run, state, echo)
-            steps = jnp.asarray(schedule.end_of_chunk(step) - step, jnp.int32)
+            steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
             began = time.perf_counter()
             state, measured = chunk(state, steps)
             measured = jax.device_get(measured)
@@ -110,7 +124,9 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         saves.whole(state, counters, record.find("eval/return", counters))
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
-            return 128 + (stop.signal or 0)
+            return 128 + stopped_by
+    if not first:
+        return 0
     checkpoint.prune(files.checkpoints, whole=WHOLE, keep=1)  # nothing will go on from here
     if "image" in run.agent.spec.observation and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
@@ -129,7 +145,7 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
       key: of the run's evaluations; every step has its own episodes.
       with_random: whether to evaluate a random policy too.
     """
-    policy_key, random_key = jax.random.split(jax.random.fold_in(key, state.counters.vector_step))
+    policy_key, random_key = jax.random.split(jax.random.fold_in(key, int(state.counters.vector_step)))
     values: dict[str, float] = {}
     if with_random:
         echo("Compiling the evaluation, and playing episodes with a random policy.")
@@ -157,20 +173,33 @@ def draw(run: Run, files: RunDirectory, record: Record) -> None:
 
 def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
     """The state to go on from, and the metrics up to it."""
-    like = {"agent": run.shapes.train, "loop": run.shapes._replace(train=())}  # type: ignore[arg-type]
+    shapes, first = run.shapes, jax.process_index() == 0
+    if jax.process_count() > 1:  # each reads the whole and keeps its share
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
+    like = {"agent": shapes.train, "loop": shapes._replace(train=())}  # type: ignore[arg-type]
     began = time.perf_counter()
     try:
         restored = checkpoint.restore(files.checkpoints, like)
     except FileNotFoundError:
+        _same_for_all(files, -1)
         state = jax.block_until_ready(run.loop.init(key))
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
-        return state, metrics.resume(files.metrics, -1)
+        return state, metrics.resume(files.metrics, -1) if first else []
     for reason in restored.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
     echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
+    _same_for_all(files, env_step)
     state = restored.items["loop"]._replace(train=restored.items["agent"])
-    return state, metrics.resume(files.metrics, env_step)
+    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if first else []
+
+
+def _same_for_all(files: RunDirectory, env_step: int) -> None:
+    if parallel.agreed(env_step) != (env_step,):
+        raise ValueError(
+            f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
+            f"{jax.process_index()}; put --logdir where all of them see it"
+        )
 
 
 def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:

@@ -70,15 +70,14 @@ def save(
     Args:
       directory: where the checkpoints of a run lie; made if need be. A checkpoint of the same step is replaced.
       step: the step that the items belong to.
-      items: name -> pytree whose leaves are arrays; typed PRNG keys are arrays too.
+      items: name -> pytree whose leaves are arrays; typed PRNG keys are arrays too. Arrays that are divided over
+        processes must be gathered first.
       score: the evaluation return at this step, by which `prune` and `restore` find the best.
       notes: what `json.dumps` takes.
 
     Raises:
       TypeError: a leaf that is no array.
     """
-    import orbax.checkpoint as ocp
-
     directory.mkdir(parents=True, exist_ok=True)
     _remove_partial(directory)
     partial = directory / f"{_PARTIAL}{step:012d}"
@@ -89,7 +88,7 @@ def save(
         described[item] = {name: _describe(array) | _evidence(array) for name, array in arrays.items()}
         stored = _stored(arrays)
         if stored:
-            with ocp.StandardCheckpointer() as checkpointer:
+            with _checkpointer() as checkpointer:
                 checkpointer.save((partial / item).absolute(), stored)
                 checkpointer.wait_until_finished()  # where an error of writing comes out
     content = {
@@ -122,7 +121,8 @@ def restore(
 
     Args:
       like: item -> pytree of arrays or `jax.ShapeDtypeStruct` (from `jax.eval_shape`): the structure, shapes and
-        dtypes to expect. Arrays go where a leaf's sharding says, else to the first device. Only these items are read.
+        dtypes to expect. Arrays go where a leaf's sharding says, else to this process's first device, as keys always
+        do. Only these items are read.
       prefer: what to try first; after the best come the others, newest first.
 
     Raises:
@@ -301,7 +301,7 @@ def _words(described: dict[str, Any] | None) -> str:
 
 def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
     expected = _flatten(like)
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
     def target(leaf: Any) -> jax.ShapeDtypeStruct:
         data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
@@ -320,11 +320,22 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
-def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
+def _checkpointer() -> Any:
+    """Orbax's, of this process alone: it would otherwise wait for all processes of a run."""
     import orbax.checkpoint as ocp
 
+    if jax.process_count() == 1:
+        return ocp.StandardCheckpointer()
+    own = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
+    return ocp.StandardCheckpointer(multiprocessing_options=options)
+
+
+def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             return checkpointer.restore(path.absolute(), like)
     except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
         first_line = next(iter(str(error).strip().splitlines()), "")

@@ -7,20 +7,23 @@ that going on from a saved one gives the same bits as never having stopped; wher
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from ne_dreamer_jax import memory, parallel
 from ne_dreamer_jax import replay as replay_lib
-from ne_dreamer_jax.types import Array, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
+from ne_dreamer_jax.types import Array, Batch, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
 
 PAPER_CAPACITY = 5_000_000
 CHUNK_UPDATES = 64  # between two of these the host can neither report, save nor stop
+REDRAWN = 64  # frames drawn together out of replay, so that what lies between state and picture stays small
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,9 @@ class LoopConfig:
     code for DeepMind Control; or both, as the released code for DeepMind Lab."""
     latent_dtype: Literal["float32", "bfloat16"] = "float32"
     """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
+    storage: Literal["pixels", "states"] = "pixels"
+    """What replay keeps of an image: its pixels, or what it is drawn from, which takes a fraction of the memory and is
+    drawn again, to the same bits, whenever it is sampled."""
 
 
 class Counters(NamedTuple):
@@ -95,8 +101,10 @@ class Loop(NamedTuple):
     """(state, vector steps int32 []) -> new state and metrics. Jitted; donates the state."""
     evaluate: Callable[..., Evaluation]
     """(params, key, episodes, random=False, frames=False) -> returns of the policy's mode, or of random actions."""
+    shapes: Callable[[], LoopState]
+    """() -> shapes and dtypes of the state and, on a mesh, where each array lies."""
     replay_bytes: int
-    """What replay will allocate."""
+    """What replay will allocate, over all devices."""
     capacity: int
     """Transitions that replay will hold."""
     chunk_steps: int
@@ -109,12 +117,20 @@ class Loop(NamedTuple):
     """Updates of the whole run."""
 
 
-def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
+def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mesh | None = None) -> Loop:
     """The training loop of an agent in an environment.
 
-    Raises ValueError where the replay can't hold a sequence, or does not fit the memory.
+    Args:
+      mesh: of `parallel`; environments, replay and batches are divided over its devices. None for one device.
+
+    Raises ValueError where the replay can't hold a sequence, or does not fit the memory, or where it is to keep states
+    of an environment whose images can't be drawn again, or where devices can't get equal shares.
     """
     n, b, length = config.num_envs, agent.config.batch_size, agent.config.batch_length
+    devices = 1 if mesh is None else mesh.size
+    for name, count in (("loop.num_envs", n), ("agent.batch_size", b)):
+        if count % devices:
+            raise ValueError(f"{name}: expected a multiple of the {devices} devices, got {count}.")
     vector_steps = -(-config.env_steps // (n * action_repeat))
     ratio = Fraction(config.replay_ratio).limit_denominator(1_000)
     if ratio == 0 and config.replay_ratio != 0:
@@ -133,6 +149,29 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     capacity = max(capacity, least) // n * n
 
     step_envs, prepare_envs = jax.vmap(env.step), jax.vmap(env.prepare)
+    step_share = parallel.per_shard(step_envs, (parallel.SPLIT, parallel.SPLIT), parallel.SPLIT)
+
+    if config.storage == "states" and env.pictures is None:
+        raise ValueError(
+            "loop.storage: expected 'pixels' for an environment without images that can be drawn again from its state, "
+            "got 'states'."
+        )
+    pictures = env.pictures if config.storage == "states" else None
+
+    def kept(env_state: Any, obs: Mapping[str, Array]) -> Mapping[str, Array]:
+        """The observation as replay keeps it."""
+        return obs if pictures is None else {**obs, "image": jax.vmap(pictures.record)(env_state)}
+
+    def redraw(records: Array) -> Array:
+        flat = records.reshape(-1, records.shape[-1])
+        images = jax.lax.map(pictures.redraw, flat, batch_size=min(REDRAWN, len(flat)))  # type: ignore[union-attr]
+        return images.reshape(*records.shape[:2], *images.shape[1:])
+
+    def seen(obs: Mapping[str, Array]) -> Mapping[str, Array]:
+        """The inverse of `kept`, for observations [B, T, ...] out of replay."""
+        if pictures is None:
+            return obs
+        return {**obs, "image": parallel.per_shard(redraw, (parallel.SPLIT,), parallel.SPLIT)(obs["image"])}
 
     def transition(timestep: TimeStep, policy: PolicyState, action: Array) -> Transition:
         is_last, is_terminal = timestep.is_last, timestep.is_terminal
@@ -146,31 +185,71 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         """The shapes of one vector step's transition."""
 
         def build() -> Transition:
-            obs = {name: jnp.zeros((n, *s.shape), s.dtype) for name, s in agent.spec.observation.items()}
+            obs: Mapping[str, Array] = {
+                name: jnp.zeros((n, *s.shape), s.dtype) for name, s in agent.spec.observation.items()
+            }
             no, policy = jnp.zeros((n,), bool), agent.init_policy(n)
+            obs = kept(prepare_envs(jax.random.split(jax.random.key(0), n)), obs)
             return transition(TimeStep(obs, jnp.zeros((n,)), no, no, no), policy, policy.prev_action)
 
         return jax.eval_shape(build)
 
     shapes, latent_dtype = example(), jnp.dtype(config.latent_dtype)
-    replay_lib.check_capacity(shapes, capacity, n, latent_dtype)
+    available = int(replay_lib.SHARE * devices * memory.available())
+    replay_lib.check_capacity(shapes, capacity, n, latent_dtype, available)
 
-    def init(key: Array) -> LoopState:
+    def make_replay() -> Any:
+        return replay_lib.init(shapes, capacity, n, latent_dtype, available)
+
+    def init_rest(key: Array) -> LoopState:
+        """The state but for replay."""
         agent_key, env_key, key = jax.random.split(key, 3)
         return LoopState(
             train=agent.init(agent_key),
             env=prepare_envs(jax.random.split(env_key, n)),
             policy=agent.init_policy(n),
-            replay=replay_lib.init(shapes, capacity, n, latent_dtype),
+            replay=(),
             episodes=Episodes(jnp.zeros((n,)), jnp.zeros((n,), jnp.int32)),
             counters=Counters(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)),
             key=key,
         )
 
+    def init(key: Array) -> LoopState:
+        if shardings is None:
+            return init_rest(key)._replace(replay=make_replay())
+        # No device ever holds the whole ring.
+        replay = jax.jit(make_replay, out_shardings=shardings.replay)()
+        return parallel.place(init_rest(key), shardings._replace(replay=()))._replace(replay=replay)
+
+    def shapes_of_state() -> LoopState:
+        state = jax.eval_shape(lambda key: init_rest(key)._replace(replay=make_replay()), jax.random.key(0))
+        if shardings is None:
+            return state
+        return jax.tree.map(lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), state, shardings)
+
+    shardings: Any = None
+    if mesh is not None:
+        state = shapes_of_state()
+        by_env = parallel.P(None, parallel.AXIS)
+        specs = LoopState(
+            train=parallel.WHOLE,  # type: ignore[arg-type]
+            env=parallel.SPLIT,
+            policy=parallel.SPLIT,  # type: ignore[arg-type]
+            replay=jax.tree.map(lambda x: by_env if x.ndim else parallel.WHOLE, state.replay),
+            episodes=parallel.SPLIT,  # type: ignore[arg-type]
+            counters=parallel.WHOLE,  # type: ignore[arg-type]
+            key=parallel.WHOLE,  # type: ignore[arg-type]
+        )
+        shardings = parallel.shardings(mesh, specs, state)
+
+    def draw_batch(replay: Any, key: Array) -> Batch:
+        batch = replay_lib.sample(replay, key, b, length)
+        return batch._replace(obs=seen(batch.obs))
+
     def update(carry: tuple[TrainState, Any, Array, Metrics]) -> tuple[TrainState, Any, Array, Metrics]:
         train, replay, key, sums = carry
         key, sample_key = jax.random.split(key)
-        batch = replay_lib.sample(replay, sample_key, b, length)
+        batch = draw_batch(replay, sample_key)
         train, latents, metrics = agent.train_step(train, batch)
         if config.write_latents:
             replay = replay_lib.write_latents(replay, batch.index, latents)
@@ -178,9 +257,10 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
 
     def vector_step(state: LoopState, sums: Metrics, episode_sums: Metrics) -> tuple[LoopState, Metrics, Metrics]:
         key, act_key, update_key = jax.random.split(state.key, 3)
-        env_state, timestep = step_envs(state.env, state.policy.prev_action)
+        env_state, timestep = step_share(state.env, state.policy.prev_action)
         policy, action = agent.act(state.train.params, state.policy, timestep, act_key)
-        replay = replay_lib.add(state.replay, transition(timestep, policy, action))
+        step = transition(timestep._replace(obs=kept(env_state, timestep.obs)), policy, action)
+        replay = replay_lib.add(state.replay, step)
 
         ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
         steps = jnp.where(timestep.is_first, 0, state.episodes.length + 1)
@@ -202,7 +282,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         return LoopState(train, env_state, policy, replay, episodes, counters, key), sums, episode_sums
 
     def chunk(state: LoopState, steps: Array) -> tuple[LoopState, Metrics]:
-        batch = jax.eval_shape(lambda r, k: replay_lib.sample(r, k, b, length), state.replay, state.key)
+        batch = jax.eval_shape(draw_batch, state.replay, state.key)
         metric_shapes = jax.eval_shape(agent.train_step, state.train, batch)[2]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metric_shapes)
         episode_sums = {name: jnp.zeros(()) for name in ("return", "length", "episodes")}
@@ -247,6 +327,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
     def evaluate(
         params: Any, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False
     ) -> Evaluation:
+        if mesh is not None:  # each process plays all the episodes on one of its devices
+            params = parallel.local(params)
         record = frames and "image" in agent.spec.observation
         carry, clips = eval_init(key, episodes or config.eval_episodes), []
         while not bool(jnp.all(carry[-1])):
@@ -259,10 +341,13 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
             video = np.concatenate(clips)
         return Evaluation(carry[3], carry[4], video)
 
+    whole = None if mesh is None else parallel.NamedSharding(mesh, parallel.WHOLE)
+    out = None if mesh is None else (shardings, whole)
     return Loop(
         init=init,
-        chunk=jax.jit(chunk, donate_argnums=0),
+        chunk=jax.jit(parallel.traced_on(mesh, chunk), donate_argnums=0, out_shardings=out),
         evaluate=evaluate,
+        shapes=shapes_of_state,
         replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
         capacity=capacity,
         chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // max(wage, 1))),
@@ -270,6 +355,35 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int) -> Loop:
         prefill=prefill * n,
         updates=updates,
     )
+
+
+def over_seeds(
+    loop: Loop,
+) -> tuple[Callable[[Array], LoopState], Callable[[LoopState, Array], tuple[LoopState, Metrics]]]:
+    """``init(keys [R])`` and ``chunk(state, steps)`` of R runs at once, for runs that are too small to fill a device.
+
+    State and metrics have a leading axis R, but for what is the same in all runs: the counters, and how full replay is.
+    So each run has its own parameters, environments and replay, and does what it would do alone. ``init`` raises
+    ValueError where memory can't hold R replays.
+    """
+    shapes = loop.shapes()
+    axes: Any = jax.tree.map(lambda _: 0, shapes)
+    axes = axes._replace(
+        counters=jax.tree.map(lambda _: None, shapes.counters),
+        replay=replace(axes.replay, position=None, size=None),
+    )
+
+    def init(keys: Array) -> LoopState:
+        needed, available = len(keys) * loop.replay_bytes, int(replay_lib.SHARE * memory.available())
+        if needed > available:
+            fit = available // loop.replay_bytes
+            raise ValueError(
+                f"{len(keys)} replays take {memory.readable(needed)}, and {memory.readable(available)} are free for "
+                f"them; expected at most {fit} seeds, or a smaller loop.capacity"
+            )
+        return jax.vmap(loop.init, out_axes=axes)(keys)
+
+    return init, jax.jit(jax.vmap(loop.chunk, in_axes=(axes, None), out_axes=(axes, 0)), donate_argnums=0)
 
 
 def random_action(spec: Any, key: Array, n: int) -> Array:

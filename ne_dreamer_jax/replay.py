@@ -5,24 +5,27 @@
     batch = sample(replay, key, batch_size, length)     # once can_sample(replay, length)
     replay = write_latents(replay, batch.index, latents)
 
-Everything but `init` compiles and, with the ring donated, works on it in place, also inside ``lax.scan``. On a mesh,
-call the functions inside ``shard_map`` with the N axis sharded: every device then samples from its own environments
-and no pixels travel.
+Everything but `init` compiles and, with the ring donated, works on it in place, also inside ``lax.scan``. On a mesh
+(`parallel.traced_on`) with the N axis divided over devices, every device samples from its own environments, so that no
+pixels travel; the sequences are the same on any number of devices.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax import memory, shapes
+from ne_dreamer_jax import memory, parallel, shapes
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, EnvSpec, Latent, Transition
 
 SHARE = 0.9
 """Of the free memory that a ring may take; the rest is for the learner."""
+
+_BY_ENV = parallel.P(None, parallel.AXIS)
 
 
 @jax.tree_util.register_dataclass
@@ -100,7 +103,9 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
     """B sequences of T steps, each with the step before it as context.
 
     Slices of T + 1 steps that are consecutive in one environment are drawn uniformly, with replacement, from all that
-    the ring holds; none contains both the newest and the oldest step of a full ring. They may cross episodes.
+    the ring holds; none contains both the newest and the oldest step of a full ring. They may cross episodes. The draw
+    is stratified over environments: sequence b comes from one between b * N / B and (b + 1) * N / B. So k devices,
+    where k divides B and N, find each their share of the sequences in their share of the environments.
 
     Args:
       replay: the ring; unless ``can_sample(replay, length)``, the batch contains steps that were never written.
@@ -118,26 +123,17 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
             f"the {rows} steps that the ring keeps of each of {envs} envs (capacity {rows * envs:,})"
         )
     starts = jnp.maximum(replay.size - length, 1)  # of slices, in each environment
-    choice = jax.random.randint(key, (batch_size, 1), 0, starts * envs)
-    oldest = replay.position - replay.size
-    row = (oldest + choice // envs + jnp.arange(length + 1, dtype=jnp.int32)[None]) % rows
-    env = jnp.broadcast_to(choice % envs, row.shape)
-
-    def take(ring: Array, steps: slice) -> Array:
-        return ring.at[row[:, steps], env[:, steps]].get(mode="promise_in_bounds")
-
-    data, current = replay.data, slice(1, None)
-    return Batch(
-        obs=jax.tree.map(lambda x: take(x, current), data.obs),
-        action=take(data.action, current),
-        prev_action=take(data.action, slice(-1)),
-        reward=take(data.reward, current),
-        is_first=take(data.is_first, current),
-        is_last=take(data.is_last, current),
-        is_terminal=take(data.is_terminal, current),
-        context=_expand(jax.tree.map(lambda x: take(x, slice(1))[:, 0], data.latent), replay.classes),
-        index=row[:, 1:] * envs + env[:, 1:],
+    start_key, env_key = jax.random.split(key)
+    start = jax.random.randint(start_key, (batch_size, 1), 0, starts)
+    # Whole numbers, so that no rounding takes an environment over the border between two devices.
+    stratum = envs * jnp.arange(batch_size, dtype=jnp.int32)[:, None]
+    env = (stratum + jax.random.randint(env_key, (batch_size, 1), 0, envs)) // batch_size
+    row = (replay.position - replay.size + start + jnp.arange(length + 1, dtype=jnp.int32)[None]) % rows
+    env = jnp.broadcast_to(env, row.shape)
+    gather = parallel.per_shard(
+        partial(_gather, replay.classes), (_BY_ENV, parallel.SPLIT, parallel.SPLIT), parallel.SPLIT
     )
+    return gather(replay.data, row, env)._replace(index=row[:, 1:] * envs + env[:, 1:])
 
 
 def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
@@ -156,18 +152,24 @@ def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
     new = _compact(latent, replay.data.latent.deter.dtype)
     expected = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*index.shape, *x.shape[2:]), x.dtype), replay.data.latent)
     shapes.check(expected, new, "the replay")
-    flat = index.reshape(-1)
-    order = jnp.argsort(flat, stable=True)
-    ordered = flat[order]
-    last = jnp.concatenate([ordered[1:] != ordered[:-1], jnp.ones(1, bool)])
-    last = jnp.zeros_like(last).at[order].set(last)
-    # Scatters with repeated indices have no order on a GPU: the others go to rows that do not exist, and are dropped.
-    row = jnp.where(last, flat // envs, rows + jnp.arange(flat.size, dtype=jnp.int32))
 
-    def put(ring: Array, x: Array) -> Array:
-        return ring.at[row, flat % envs].set(x.reshape(flat.size, *x.shape[2:]), mode="drop", unique_indices=True)
+    def scatter(ring: Latent, index: Array, new: Latent) -> Latent:
+        flat = index.reshape(-1)
+        order = jnp.argsort(flat, stable=True)
+        ordered = flat[order]
+        last = jnp.concatenate([ordered[1:] != ordered[:-1], jnp.ones(1, bool)])
+        last = jnp.zeros_like(last).at[order].set(last)
+        # Scatters with repeated indices have no order on a GPU: the others go to rows that do not exist, and are lost.
+        row = jnp.where(last, flat // envs, rows + jnp.arange(flat.size, dtype=jnp.int32))
+        env = flat % envs % ring.deter.shape[1]  # among those of this device
 
-    return replace(replay, data=replay.data._replace(latent=jax.tree.map(put, replay.data.latent, new)))
+        def put(ring: Array, x: Array) -> Array:
+            return ring.at[row, env].set(x.reshape(flat.size, *x.shape[2:]), mode="drop", unique_indices=True)
+
+        return jax.tree.map(put, ring, new)
+
+    scatter = parallel.per_shard(scatter, (_BY_ENV, parallel.SPLIT, parallel.SPLIT), _BY_ENV)
+    return replace(replay, data=replay.data._replace(latent=scatter(replay.data.latent, index, new)))
 
 
 def nbytes(example: Transition, capacity: int, num_envs: int, deter_dtype: Any = jnp.float32) -> int:
@@ -261,6 +263,27 @@ def random_batch(
             jax.random.uniform(deter_key, (batch, deter_size), minval=-1.0), jax.nn.one_hot(classes, class_count)
         ),
         index=jnp.arange(batch * steps, dtype=jnp.int32).reshape(batch, steps),
+    )
+
+
+def _gather(classes: int, data: Transition, row: Array, env: Array) -> Batch:
+    """The steps at these places [B, T + 1] of a ring, without their index."""
+    env = env % data.reward.shape[1]  # among those of this device
+
+    def take(ring: Array, steps: slice) -> Array:
+        return ring.at[row[:, steps], env[:, steps]].get(mode="promise_in_bounds")
+
+    current = slice(1, None)
+    return Batch(
+        obs=jax.tree.map(lambda x: take(x, current), data.obs),
+        action=take(data.action, current),
+        prev_action=take(data.action, slice(-1)),
+        reward=take(data.reward, current),
+        is_first=take(data.is_first, current),
+        is_last=take(data.is_last, current),
+        is_terminal=take(data.is_terminal, current),
+        context=_expand(jax.tree.map(lambda x: take(x, slice(1))[:, 0], data.latent), classes),
+        index=row[:, current],
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.envs.base import Core, Env, Progress, from_core, restart_or_step
+from ne_dreamer_jax.envs.base import Core, Env, Pictures, Progress, from_core, restart_or_step
 from ne_dreamer_jax.types import (
     ArraySpec,
     ContinuousAction,
@@ -66,7 +66,12 @@ def env(discrete: bool = False, image: bool = True, breaks: bool = False) -> Env
         obs = {"vector": jnp.stack(seen), "image": jnp.full((8, 8, 3), state.t, jnp.uint8)}
         return {name: obs[name] for name in observation}
 
-    return from_core(Core(EnvSpec(observation, action), reset, restart_or_step(reset, step), observe))
+    pictures = Pictures(
+        record=lambda state: state.t.astype(jnp.float32)[None],
+        redraw=lambda record: jnp.full((8, 8, 3), record[0].astype(jnp.uint8)),
+    )
+    spec = EnvSpec(observation, action)
+    return from_core(Core(spec, reset, restart_or_step(reset, step), observe, pictures if image else None))
 
 
 def stub(spec: EnvSpec, batch_size: int = 2, batch_length: int = 3, weight: float = 0.5) -> Any:

@@ -147,15 +147,35 @@ def test_one_call_per_state_no_input_but_the_batch_is_read(update):
     assert_same(got, want)
 
 
-def test_bfloat16_products_change_the_losses_little(update):
-    agent = make_agent(REPLACE(update.agent.config, compute_dtype="bfloat16"), tiny.BOTH)
-    state, latents, metrics = agent.train_step(tiny.state(agent), update.batch)
+@pytest.fixture(scope="module")
+def half(update):
+    return make_agent(REPLACE(update.agent.config, compute_dtype="bfloat16"), tiny.BOTH)
+
+
+def test_bfloat16_products_change_the_losses_little(update, half):
+    state, latents, metrics = half.train_step(tiny.state(half), update.batch)
     kinds = {x.dtype for x in jax.tree.leaves((state.params, state.optimizer, latents, metrics))}
     assert kinds <= {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32)}
     for name in ("next_embedding", "reward", "continue", "representation", "critic", "replay_critic"):
         got, want = float(metrics[f"loss/{name}"]), float(update.metrics[f"loss/{name}"])
         assert got != want, name
         np.testing.assert_allclose(got, want, rtol=0.1, err_msg=name)
+
+
+def test_over_200_updates_bfloat16_learns_what_float32_does(update, half):
+    batches = [tiny.batch(seed=seed) for seed in range(8)]
+    curves = []
+    for agent in (update.agent, half):
+        state, losses = tiny.state(agent), []
+        for number in range(200):
+            state, _, metrics = agent.train_step(state, batches[number % len(batches)])
+            losses.append(metrics["loss/total"])
+        curves.append(np.asarray(losses))
+    exact, rounded = curves
+    assert exact[-40:].mean() < 0.9 * exact[:40].mean()  # it learns
+    assert (exact != rounded).all()
+    assert abs(rounded.mean() / exact.mean() - 1) < 0.01
+    np.testing.assert_allclose(rounded[-40:].mean(), exact[-40:].mean(), rtol=0.03)
 
 
 # Acting.

@@ -292,6 +292,7 @@ CHANGES = {
         "write_latents": "false",
         "time_limits": "unmarked",
         "latent_dtype": "bfloat16",
+        "storage": "states",
     },
 }
 
@@ -376,7 +377,7 @@ def train_step(config):
 
 def loop(config):
     """Sizes, the schedule and the compiled program."""
-    env = counting.env(image=False)
+    env = counting.env()
     made = loops.make(config.loop, env, counting.stub(env.spec), 2)
     yield str((made.vector_steps, made.updates, made.capacity, made.replay_bytes, config.loop.eval_episodes))
     yield str(Schedule.of(config, made))

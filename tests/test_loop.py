@@ -2,6 +2,7 @@
 tests run the whole agent."""
 
 import dataclasses
+import operator
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -198,6 +199,61 @@ def test_latents_are_stored_in_the_chosen_dtype():
     state = jax.eval_shape(make(latent_dtype="bfloat16").init, jax.random.key(0))
     assert state.replay.data.latent.deter.dtype == jnp.bfloat16
     assert make(latent_dtype="bfloat16").replay_bytes < make().replay_bytes
+
+
+def test_runs_of_several_seeds_at_once_are_those_runs(learning):
+    init, chunk = loops.over_seeds(learning.loop)
+    seeds = [3, 0]
+    together = init(jnp.stack([jax.random.key(seed) for seed in seeds]))
+    assert together.replay.position.shape == together.counters.vector_step.shape == ()
+    for n in (5, STEPS - 5):
+        together, metrics = chunk(together, steps(n))
+    assert metrics["update"].shape == (2,)
+    for i, seed in enumerate(seeds):
+        alone, (_, want) = ran(learning.loop, 5, STEPS - 5, seed=seed)
+        one = jax.tree.map(operator.itemgetter(i), together._replace(counters=(), replay=together.replay.data))
+        ring = dataclasses.replace(together.replay, data=one.replay)
+        assert_same(one._replace(counters=together.counters, replay=ring), alone)
+        np.testing.assert_allclose(metrics["update"][i], want["update"])
+
+
+def test_more_replays_than_memory_holds_are_refused(monkeypatch):
+    loop = make()
+    monkeypatch.setattr(loops.memory, "available", lambda: 3 * loop.replay_bytes)
+    init, _ = loops.over_seeds(loop)
+    with pytest.raises(ValueError, match="expected at most 2 seeds"):
+        init(jax.random.split(jax.random.key(0), 3))
+
+
+def test_states_in_replay_give_the_pixels_back():
+    """The learner's batches are the same to the bit, and replay is smaller by what the images took."""
+
+    def last_batch(storage):
+        env = counting.env()
+        agent = counting.stub(env.spec)
+        learn, seen = agent.train_step, []
+
+        def train_step(state, batch):
+            jax.debug.callback(lambda *obs: seen.append(obs), batch.obs["image"], batch.obs["vector"], ordered=True)
+            return learn(state, batch)
+
+        agent.train_step = train_step
+        loop = loops.make(dataclasses.replace(CONFIG, storage=storage), env, agent, action_repeat=2)
+        ran(loop, STEPS)
+        jax.effects_barrier()
+        return loop, seen
+
+    (pixels, want), (states, got) = last_batch("pixels"), last_batch("states")
+    assert len(want) == pixels.updates > 3
+    assert_same(got, want)
+    assert want[0][0].shape == (2, 3, 8, 8, 3)
+    assert states.capacity == pixels.capacity
+    assert pixels.replay_bytes - states.replay_bytes == pixels.capacity * (8 * 8 * 3 - 4)
+
+
+def test_states_are_refused_where_images_cannot_be_drawn_again():
+    with pytest.raises(ValueError, match=r"loop.storage: expected 'pixels'"):
+        make(image=False, storage="states")
 
 
 def episodes_of_the_mode(names):

@@ -1,9 +1,6 @@
 """The ring against a plain record of everything that was added to it."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -212,45 +209,17 @@ def test_compiled_collect_and_learn_works_on_the_ring_in_place():
     assert np.isfinite(totals).all()
 
 
-SHARDED = """
-import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import NamedSharding, PartitionSpec as P
-from ne_dreamer_jax import replay
-from tests.test_replay import K, S, transition
-from ne_dreamer_jax.types import Latent
-
-mesh = jax.make_mesh((2,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
-rows, envs = 7, 4
-state = replay.init(transition(0, envs), rows * envs, envs)
-spec = jax.tree.map(lambda x: P(None, "data") if x.ndim else P(), state)
-state = jax.device_put(state, jax.tree.map(lambda p: NamedSharding(mesh, p), spec))
-
-def step(state, transition, key):
-    state = replay.add(state, transition)
-    batch = replay.sample(state, jax.random.fold_in(key, jax.lax.axis_index("data")), 8, 3)
-    new = Latent(jnp.full((8, 3, 4), -1.0), jnp.broadcast_to(jax.nn.one_hot(jnp.int32(4), K), (8, 3, S, K)))
-    return replay.write_latents(state, batch.index, new), batch
-
-mapped = jax.shard_map(step, mesh=mesh, in_specs=(spec, P("data"), P()), out_specs=(spec, P("data")))
-compiled = jax.jit(mapped).lower(state, transition(0, envs), jax.random.key(0)).compile()
-assert not any(word in compiled.as_text() for word in ("all-gather", "all-reduce", "all-to-all", "collective-permute"))
-for t in range(10):
-    state, batch = jax.jit(mapped)(state, transition(t, envs), jax.random.key(t))
-env, step = np.asarray(batch.obs["code"]).astype(int).transpose(2, 0, 1)
-assert (env == env[:, :1]).all() and (step == step[:, :1] + np.arange(3)).all() and step.min() > 3 and step.max() < 10
-assert set(env[:8].ravel()) == {0, 1} and set(env[8:].ravel()) == {2, 3}
-deter = np.asarray(state.data.latent.deter)
-assert (deter[step % rows, env] == -1).all()
-"""
-
-
-@pytest.mark.slow
-def test_sharded_over_two_devices_every_one_samples_its_own_environments():
-    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
-    out = subprocess.run(
-        [sys.executable, "-c", SHARDED], env={**os.environ, **flags}, capture_output=True, text=True, timeout=300
-    )
-    assert out.returncode == 0, out.stderr
+def test_every_environment_has_its_share_of_every_batch():
+    """Stratified, so that devices with equal shares of the environments have equal shares of the batch."""
+    for batch_size in (1, 2, 4, 6, 7):
+        shares = []
+        for seed in range(60):
+            env, _ = origin(sample(ring(20), jax.random.key(seed), batch_size, 3))
+            place = env[:, 0]
+            assert (place >= np.arange(batch_size) * N // batch_size).all()
+            assert (place <= ((np.arange(batch_size) + 1) * N - 1) // batch_size).all()
+            shares.append(np.bincount(place, minlength=N))
+        assert (np.mean(shares, 0) > 0).all()
 
 
 def test_bytes_are_known_before_allocation():

@@ -29,6 +29,13 @@ class Progress(NamedTuple):
     is_sound: Array  # bool [], False where the simulation broke down
 
 
+class Pictures(NamedTuple):
+    """How to keep what an image is drawn from in place of the image: far fewer bytes, for the time to draw again."""
+
+    record: Callable[[Any], Array]  # state -> float32 [P]
+    redraw: Callable[[Array], Array]  # float32 [P] -> the observation's "image", to the bit
+
+
 class Core(NamedTuple):
     """A simulation as pure functions.
 
@@ -41,6 +48,7 @@ class Core(NamedTuple):
     reset: Callable[[Array], CoreState]  # key -> first state of an episode
     step: Callable[[CoreState, Array, Array, Array], tuple[CoreState, Progress]]
     observe: Callable[[CoreState], dict[str, Array]]  # as spec.observation; the only place where pixels are drawn
+    pictures: Pictures | None = None  # where the observation has an "image" that can be drawn again
 
 
 class EnvState(NamedTuple):
@@ -63,7 +71,8 @@ class Env(NamedTuple):
     ``reset(key) -> (EnvState, TimeStep)``; ``step(state, action) -> (EnvState, TimeStep)``;
     ``observe(state) -> obs``, the observation of the state's time step over again;
     ``prepare(key) -> EnvState``, a state from which the first ``step`` begins an episode. A program that starts there
-    needs no ``reset``, whose compilation costs as much as that of ``step``.
+    needs no ``reset``, whose compilation costs as much as that of ``step``;
+    ``pictures``, how images can be drawn again from less, or None.
 
     After a time step with ``is_last`` the next ``step`` ignores its action and returns the first time step of a new
     episode (``is_first``, reward 0), started from a key never used before.
@@ -74,6 +83,7 @@ class Env(NamedTuple):
     step: Callable[[EnvState, Array], tuple[EnvState, TimeStep]]
     observe: Callable[[EnvState], dict[str, Array]]
     prepare: Callable[[Array], EnvState]
+    pictures: Pictures | None = None
 
 
 def if_needed(needed: Array, compute: Callable[[], T], otherwise: T) -> T:
@@ -146,4 +156,8 @@ def from_core(core: Core) -> Env:
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), core_shapes())
         return EnvState(nothing, key, jnp.ones((), bool), jnp.zeros((), jnp.int32))
 
-    return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare)
+    pictures = core.pictures
+    if pictures is not None:
+        record = pictures.record
+        pictures = pictures._replace(record=lambda state: record(state.core))
+    return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare, pictures)

@@ -4,8 +4,8 @@ On accelerators these are `lax.conv_general_dilated` and plain compositions arou
 on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
 matrix products over a few images at a time.
 
-On several CPU devices wrap the call in `jax.shard_map` over the images: the loop over chunks of a global array would
-otherwise run whole on every device.
+On a mesh of CPU devices each takes its share of the images: the loop over chunks of a global array would otherwise run
+whole on every device.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ne_dreamer_jax import parallel
 from ne_dreamer_jax.nets import cpu_conv
 from ne_dreamer_jax.nets.blocks import rms_norm
 from ne_dreamer_jax.nets.cpu_conv import Stage as Stage
@@ -37,7 +38,7 @@ def conv2d(x: Array, kernel: Array) -> Array:
             f"and {kernel.dtype} {list(kernel.shape)}."
         )
     if on_cpu() and x.dtype == jnp.float32:
-        return cpu_conv.conv2d(x, kernel)
+        return parallel.per_shard(cpu_conv.conv2d, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)(x, kernel)
     return lax_conv2d(x, kernel)
 
 
@@ -91,7 +92,8 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
             f"them, got {list(images.shape)}. Resize the images or use fewer stages."
         )
     if on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
-        return cpu_conv.encode_images(images, stages)
+        encode = parallel.per_shard(cpu_conv.encode_images, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)
+        return encode(images, stages)
     return lax_encode_images(images, stages, dtype)
 
 

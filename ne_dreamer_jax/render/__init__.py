@@ -10,7 +10,8 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 from ne_dreamer_jax.render.build import build
 from ne_dreamer_jax.render.picture import draw
+from ne_dreamer_jax.render.record import record, recorded
 from ne_dreamer_jax.render.scene import Scene
 from ne_dreamer_jax.render.solids import Overrides
 
-__all__ = ["Overrides", "Scene", "build", "draw"]
+__all__ = ["Overrides", "Scene", "build", "draw", "record", "recorded"]

@@ -66,6 +66,7 @@ def build(config, *, image: bool = True) -> training.Run:
         init,
         chunk,
         evaluate,
+        shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
         replay_bytes=total * n,
         capacity=total * n,
         chunk_steps=config.loop.chunk_steps,
@@ -73,7 +74,7 @@ def build(config, *, image: bool = True) -> training.Run:
         prefill=prefill * n,
         updates=total - prefill,
     )
-    return training.Run(config, agent, loop, jax.eval_shape(init, jax.random.key(0)))  # type: ignore[arg-type]
+    return training.Run(config, agent, loop, loop.shapes())  # type: ignore[arg-type]
 
 
 def run() -> training.Run:

@@ -1,6 +1,7 @@
 """The commands refuse what is mistyped before JAX loads, and anything that is not theirs."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -84,6 +85,28 @@ def test_what_does_not_fit_memory_leaves_no_directory(tmp_path):
     assert code == 2
     assert "memory" in output or "capacity" in output
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--processes", 2], ["--coordinator", "localhost:1"], ["--coordinator", "x:1", "--processes", 2, "--process", 2]],
+)
+def test_processes_need_a_coordinator_and_a_number_each(tmp_path, arguments):
+    code, output = invoke(train, "--logdir", tmp_path / "run", *arguments)
+    assert (code, "expected --coordinator, --processes and --process together" in output) == (2, True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_more_devices_than_there_are_leave_no_directory(tmp_path):
+    code, output = invoke(train, "--preset", "smoke", "--devices", 1024, "--logdir", tmp_path / "run")
+    assert (code, "as many as each process has, got 1024" in output) == (2, True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_determinism_is_asked_of_xla_beside_what_the_user_asks(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert invoke(train, "--settings", "--deterministic")[0] == 0
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false --xla_gpu_deterministic_ops=true"
 
 
 def test_options_and_settings_shape_the_configuration():

@@ -75,20 +75,25 @@ def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base
         progress = base.Progress(reward, is_last=steps_left <= 0, is_terminal=false, is_sound=sound)
         return State(data, episode, steps_left), progress
 
-    spec, observe = _make_observe(task, obs, image_size)
-    return base.Core(EnvSpec(spec, ContinuousAction(simulation.mj_model.nu)), reset, step, observe)
+    spec, observe, pictures = _make_observe(task, obs, image_size)
+    return base.Core(EnvSpec(spec, ContinuousAction(simulation.mj_model.nu)), reset, step, observe, pictures)
 
 
 def _make_observe(
     task: Task, obs: str, image_size: int
-) -> tuple[dict[str, ArraySpec], Callable[[State], dict[str, Array]]]:
-    """What is observed, and the function that observes it."""
+) -> tuple[dict[str, ArraySpec], Callable[[State], dict[str, Array]], base.Pictures | None]:
+    """What is observed, the function that observes it, and how its image can be drawn again."""
     spec: dict[str, ArraySpec] = {}
+    pictures = None
     if obs != "vector":
         from ne_dreamer_jax import render
 
         scene = render.build(task.simulation.mj_model, task.camera, height=image_size, width=image_size)
         spec["image"] = ArraySpec((image_size, image_size, 3), jnp.uint8)
+        pictures = base.Pictures(
+            record=lambda state: render.record(scene, task.pose(state.physics, state.episode)),
+            redraw=lambda vector: render.draw(scene, render.recorded(scene, vector)),
+        )
     if obs != "pixels":
         vectors: Any = jax.eval_shape(task.observe, task.simulation.initial(), task.episode)
         spec |= {name: ArraySpec(value.shape, jnp.float32) for name, value in vectors.items()}
@@ -102,4 +107,4 @@ def _make_observe(
             observation |= {name: value.astype(jnp.float32) for name, value in vectors.items()}
         return observation
 
-    return spec, observe
+    return spec, observe, pictures

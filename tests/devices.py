@@ -1,0 +1,137 @@
+"""What `test_parallel` has computed on 8 virtual devices, in a process of its own: ``python -m tests.devices PART...``.
+
+Prints one JSON object: the name of each part, and what it found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ne_dreamer_jax import agent as agents
+from ne_dreamer_jax import checkpoint, parallel
+from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.loop import LoopConfig
+from tests import counting, tiny
+
+N, B, STEPS = 16, 8, 20
+CONFIG = LoopConfig(
+    env_steps=N * STEPS, num_envs=N, replay_ratio=2.0, prefill=0, chunk_steps=4, eval_every=60, eval_episodes=3
+)
+
+
+@functools.cache
+def stub_loop(devices: int, storage: str = "pixels") -> loops.Loop:
+    """A loop whose learner is a stub, on so many devices; 1 is without a mesh. Compiled once for all that is asked."""
+    env = counting.env()
+    mesh = None if devices == 1 else parallel.make_mesh(devices)
+    agent = counting.stub(env.spec, B)
+    loop = loops.make(dataclasses.replace(CONFIG, storage=storage), env, agent, action_repeat=1, mesh=mesh)
+    jitted: Any = loop.chunk
+    return loop._replace(chunk=jitted.lower(loop.shapes(), jax.ShapeDtypeStruct((), jnp.int32)).compile())
+
+
+def ran(loop: loops.Loop, state: Any, steps: int) -> Any:
+    """The state after some steps."""
+    return loop.chunk(state, np.asarray(steps, np.int32))[0]  # type: ignore[arg-type]
+
+
+def arrays(tree: Any) -> list[np.ndarray]:
+    """All leaves on the host, keys as their data."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(tree)]
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether all bits are equal."""
+    return all(x.dtype == y.dtype and x.tobytes() == y.tobytes() for x, y in zip(arrays(a), arrays(b), strict=True))
+
+
+def placed(loop: loops.Loop, state: Any) -> bool:
+    """Whether every array lies where the loop says."""
+    pairs = zip(jax.tree.leaves(state), jax.tree.leaves(loop.shapes()), strict=True)
+    return all(x.sharding.is_equivalent_to(want.sharding, x.ndim) for x, want in pairs)
+
+
+def environments_and_replay() -> dict[str, Any]:
+    """The whole state of runs on 1, 2 and 8 devices, with pixels and with states in replay."""
+    out: dict[str, Any] = {}
+    for storage, counts in (("pixels", (1, 2, 8)), ("states", (1, 8))):
+        loops_ = {devices: stub_loop(devices, storage) for devices in counts}
+        states = {devices: ran(loop, loop.init(jax.random.key(0)), STEPS) for devices, loop in loops_.items()}
+        out[f"equal, {storage}"] = [same(states[1], states[devices]) for devices in counts[1:]]
+        out[f"placed, {storage}"] = [placed(loops_[devices], states[devices]) for devices in counts[1:]]
+        out["updates"] = int(states[1].train.update)
+        shard = states[8].replay.data.obs["image"].addressable_shards[0].data
+        out[f"share, {storage}"] = states[8].replay.data.obs["image"].shape[1] / shard.shape[1]
+    returns = [np.asarray(loops_[d].evaluate(states[d].train.params, jax.random.key(1)).returns) for d in (1, 8)]
+    out["evaluation"] = bool((returns[0] == returns[1]).all())
+    return out
+
+
+def collectives() -> dict[str, int]:
+    """How often each collective stands in the program that collects and samples on 8 devices."""
+    compiled: Any = stub_loop(8).chunk
+    text = compiled.as_text()
+    names = ("all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter")
+    return {name: sum(f" {name}(" in line or f" {name}-start(" in line for line in text.splitlines()) for name in names}
+
+
+def moved() -> dict[str, bool]:
+    """Runs that change the number of devices at a checkpoint, against one that does not."""
+    straight = stub_loop(1)
+    want = ran(straight, straight.init(jax.random.key(0)), STEPS)
+    out = {}
+    for before, after in ((1, 8), (8, 1), (8, 2)):
+        old, new = stub_loop(before), stub_loop(after)
+        state = ran(old, old.init(jax.random.key(0)), 9)
+        with tempfile.TemporaryDirectory() as folder:
+            checkpoint.save(Path(folder), 9, {"all": state})
+            restored = checkpoint.restore(Path(folder), {"all": new.shapes()}).items["all"]
+        state = parallel.move(restored, new.shapes())
+        out[f"{before} to {after}"] = same(ran(new, state, STEPS - 9), want) and (after == 1 or placed(new, state))
+    return out
+
+
+def whole_agent() -> dict[str, Any]:
+    """Losses of the whole agent's updates in the loop, on 1 and on 8 devices."""
+    env = counting.env(image=True)
+    config = dataclasses.replace(tiny.CONFIG, batch_size=B, batch_length=4)
+    out: dict[str, Any] = {}
+    for devices in (1, 8):
+        agent = agents.make_agent(config, env.spec)
+        mesh = None if devices == 1 else parallel.make_mesh(devices)
+        loop = loops.make(dataclasses.replace(CONFIG, replay_ratio=2.0), env, agent, 1, mesh)
+        # The parameters come from numpy; compiling their initialisation would take longer than all the rest.
+        rest = stub_loop(1).init(jax.random.key(0))
+        shapes = loop.shapes()
+        replay = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.replay)
+        start = rest._replace(train=tiny.state(agent), policy=agent.init_policy(N), replay=replay)
+        state, curve = parallel.move(start, shapes), []
+        for _ in range(STEPS):
+            state, metrics = loop.chunk(state, np.asarray(1, np.int32))
+            curve.append({name: float(value) for name, value in metrics.items() if name.startswith("loss/")})
+        out[str(devices)] = curve
+    return out
+
+
+def main(*names: str) -> None:
+    """Computes the parts of these names."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    parts = {part.__name__: part for part in (environments_and_replay, collectives, moved, whole_agent)}
+    print(json.dumps({name: parts[name]() for name in names}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
