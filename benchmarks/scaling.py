@@ -45,7 +45,7 @@ def main(
 
     spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(actions))
     with refusing(ValueError):
-        config = configure("dmc", size, None, {}, assignments).agent
+        config: Any = configure("dmc", size, None, {}, assignments).agent
     sizes = dict.fromkeys([*((16, length) for length in lengths), *((batch, 64) for batch in batches)])
     cases: dict[str, Callable[[], Any]] = {}
     columns: dict[str, dict[str, Any]] = {}

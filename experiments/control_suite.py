@@ -25,8 +25,10 @@ class Player:
     """One environment of dm_control, stepped and observed as ours are."""
 
     def __init__(self, config: EnvConfig, seed: int) -> None:
+        from absl import logging
         from dm_control import suite
 
+        logging.set_verbosity(logging.ERROR)  # cheetah's file is in an older style, and MuJoCo says so each time
         domain, task = registry.split_dmc(config.task)
         self._env = suite.load(domain, task, task_kwargs={"random": seed})
         self._config = config
