@@ -265,8 +265,12 @@ def _data(leaf: Any) -> Any:
 
 
 def _stored(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """What goes to Orbax, which refuses arrays without elements; those are made anew."""
-    return {name: _data(array) for name, array in arrays.items() if math.prod(array.shape)}
+    """What goes to Orbax, which refuses arrays without elements; those are made anew.
+
+    In one process of several it takes numpy's alone, since a ``jax.Array`` would have to be known to all of them.
+    """
+    data = {name: _data(array) for name, array in arrays.items() if math.prod(array.shape)}
+    return data if jax.process_count() == 1 else {name: np.asarray(array) for name, array in data.items()}
 
 
 def _describe(array: Any) -> dict[str, Any]:
