@@ -52,15 +52,14 @@ def main(
         config = configure("dmc", size, None, {}, assignments).agent
         mesh = parallel.make_mesh(devices)
     compiled = _compiled(config, mesh)
-    found: dict[tuple[str, str], list[int]] = {}
+    found: dict[str, list[int]] = {}
     for line in compiled.as_text().splitlines():
         match = _COLLECTIVE.search(line)
         if match:
-            part = (re.findall(r'op_name="[^"]*?/([^"]*)"', line) or ["?"])[0].split("/")[0]
-            found.setdefault((match["kind"], part), []).append(result_bytes(match["result"]))
+            found.setdefault(match["kind"], []).append(result_bytes(match["result"]))
     rows: list[dict[str, Any]] = [
-        {"collective": kind, "of": part, "count": len(sizes), "megabytes": sum(sizes) / 1e6}
-        for (kind, part), sizes in sorted(found.items(), key=lambda item: -sum(item[1]))
+        {"collective": kind, "count": len(sizes), "megabytes": sum(sizes) / 1e6, "largest": max(sizes) / 1e6}
+        for kind, sizes in sorted(found.items(), key=lambda item: -sum(item[1]))
     ]
     sent = sum(row["megabytes"] for row in rows) * 1e6
     accessed = compiled.cost_analysis().get("bytes accessed", 0.0)

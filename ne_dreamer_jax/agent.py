@@ -92,6 +92,9 @@ class Agent(NamedTuple):
     """(state, batch) -> new state, the posterior latents [B, T, ...] for replay, and metrics. Jitted; donates state."""
     config: Any
     spec: EnvSpec
+    working_bytes: Callable[[Params], int] = lambda params: 0
+    """params (shapes suffice) -> about what an update allocates beside state and batch, which benchmarks.memory
+    measures; 0 where that is little."""
 
 
 def make_agent(config: AgentConfig | DrQv2Config, spec: EnvSpec) -> Agent:
@@ -193,6 +196,7 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         train_step=jax.jit(train_step, donate_argnums=0),
         config=config,
         spec=spec,
+        working_bytes=lambda params: _working_bytes(config, nets.feature, params),
     )
 
 
@@ -205,6 +209,13 @@ def world_model_of(nets: Networks, length: int) -> Model:
 def parameter_counts(params: Params) -> dict[str, int]:
     """Number of parameters by module name."""
     return {name: sum(x.size for x in jax.tree.leaves(tree)) for name, tree in params.items()}
+
+
+def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
+    """Gradients and what becomes of them; about ten arrays of all imagined features; the encoder's, by frames."""
+    steps = config.batch_size * config.batch_length
+    imagined = 4 * feature * steps * (config.behavior.horizon + 1)
+    return 3 * 4 * sum(parameter_counts(params).values()) + 10 * imagined + 200_000 * steps
 
 
 def _compute_dtype(name: str) -> Any:

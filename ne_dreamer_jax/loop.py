@@ -195,7 +195,11 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         return jax.eval_shape(build)
 
     shapes, latent_dtype = example(), jnp.dtype(config.latent_dtype)
-    available = int(replay_lib.SHARE * devices * memory.available())
+    train = jax.eval_shape(agent.init, jax.random.key(0))
+    learner = devices * _nbytes(train) + agent.working_bytes(
+        train.params
+    )  # the state is on every device, the work divided
+    available = int(replay_lib.SHARE * max(0, devices * memory.available() - learner))
     replay_lib.check_capacity(shapes, capacity, n, latent_dtype, available)
 
     def make_replay() -> Any:
@@ -384,6 +388,12 @@ def over_seeds(
         return jax.vmap(loop.init, out_axes=axes)(keys)
 
     return init, jax.jit(jax.vmap(loop.chunk, in_axes=(axes, None), out_axes=(axes, 0)), donate_argnums=0)
+
+
+def _nbytes(tree: Any) -> int:
+    """Of all arrays but typed keys, which are small."""
+    arrays = [x for x in jax.tree.leaves(tree) if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)]
+    return sum(x.size * x.dtype.itemsize for x in arrays)
 
 
 def random_action(spec: Any, key: Array, n: int) -> Array:

@@ -23,7 +23,7 @@ from ne_dreamer_jax import memory, parallel, shapes
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, EnvSpec, Latent, Transition
 
 SHARE = 0.9
-"""Of the free memory that a ring may take; the rest is for the learner."""
+"""Of the free memory that a ring may take, the learner's already left out where it is known; the rest is spare."""
 
 _BY_ENV = parallel.P(None, parallel.AXIS)
 

@@ -111,4 +111,12 @@ def stub(spec: EnvSpec, batch_size: int = 2, batch_length: int = 3, weight: floa
         return state._replace(params=state.params + weight, update=update), latent(mark), metrics
 
     config = SimpleNamespace(batch_size=batch_size, batch_length=batch_length)
-    return SimpleNamespace(init=init, init_policy=init_policy, act=act, train_step=train_step, config=config, spec=spec)
+    return SimpleNamespace(
+        init=init,
+        init_policy=init_policy,
+        act=act,
+        train_step=train_step,
+        config=config,
+        spec=spec,
+        working_bytes=lambda params: 0,
+    )

@@ -217,6 +217,18 @@ def test_runs_of_several_seeds_at_once_are_those_runs(learning):
         np.testing.assert_allclose(metrics["update"][i], want["update"])
 
 
+def test_replay_gets_nine_tenths_of_what_the_learner_leaves(monkeypatch):
+    env = counting.env()
+    agent = counting.stub(env.spec)
+    config = dataclasses.replace(CONFIG, capacity=600)
+    per_step = loops.make(config, env, agent, 2).replay_bytes / 600
+    agent.working_bytes = lambda params: 10**6
+    monkeypatch.setattr(loops.memory, "available", lambda: int(10**6 + 300 * per_step / 0.9) + 100)
+    loops.make(dataclasses.replace(config, capacity=300), env, agent, 2)
+    with pytest.raises(ValueError, match="expected a capacity of at most 300 steps"):
+        loops.make(config, env, agent, 2)
+
+
 def test_more_replays_than_memory_holds_are_refused(monkeypatch):
     loop = make()
     monkeypatch.setattr(loops.memory, "available", lambda: 3 * loop.replay_bytes)
