@@ -128,7 +128,7 @@ def test_steps_sensors_and_restarts_are_mujocos(kind, n_sub_steps):
         data = advance(data, jnp.asarray(control, jnp.float32), never, first)
         reference.advance(control, n_sub_steps)
         assert_like(data, reference)
-    assert np.ptp(reference.data.sensordata) > 0.1 or not model.nsensor
+    assert not model.nsensor or np.ptp(reference.data.sensordata) > 0.1
     if kind == "contact":
         assert reference.data.ncon == 1
 
