@@ -168,11 +168,13 @@ def free_run(name: str, player: Player, num_steps: int, num_runs: int, tolerance
 
 
 def our_resets(task: Task, num_resets: int, seed: int = 0) -> np.ndarray:
-    """First states by our task: [num_resets, positions, velocities and what the episode draws]."""
+    """First states by our environment: [num_resets, positions, velocities and what the episode draws]."""
+    core = environment.make_core(task, "vector", action_repeat=2, image_size=64)
 
     def draw(key: jax.Array) -> jax.Array:
-        data, episode = task.reset(key)
-        return jnp.concatenate([data.qpos, data.qvel, *map(jnp.ravel, jax.tree.leaves(episode))])
+        state = core.reset(key)
+        drawn = map(jnp.ravel, jax.tree.leaves(state.episode))
+        return jnp.concatenate([state.physics.qpos, state.physics.qvel, *drawn])
 
     return np.asarray(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(seed), num_resets)))
 

@@ -64,23 +64,32 @@ class Trajectory(NamedTuple):
     """M imagined trajectories."""
 
     feature: Array  # float32 [H + 1, M, F]
+    policy: Array  # float32 [H, M, outputs], the actor's outputs at all states but the last
     action: Array  # float32 [H, M, A], raw samples: not clipped
 
 
-def imagine(nets: Networks, params: Params, key: Array, start: Latent, horizon: int) -> Trajectory:
-    """H steps of the prior under the policy from ``start`` [M, ...]; the models see clipped actions."""
+def imagine(
+    nets: Networks, params: Params, key: Array, start: Latent, horizon: int, through_model: bool = False
+) -> Trajectory:
+    """H steps of the prior under the policy from ``start`` [M, ...]; the models see clipped actions.
 
-    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Array, Array]]:
+    Gradients of ``policy`` reach the actor's parameters. Those of states and actions do so only where
+    ``through_model``; otherwise actions are constants, and the actor need not be run again for its loss.
+    """
+
+    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Array, Array, Array]]:
         action_key, latent_key = jax.random.split(key)
         state = feature(latent)
-        raw = policy(nets.heads, nets.spec.action, nets.apply("actor", params, state)).sample(action_key)
+        outputs = nets.apply("actor", params, state)
+        raw = policy(nets.heads, nets.spec.action, outputs).sample(action_key)
+        raw = raw if through_model else jax.lax.stop_gradient(raw)
         uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
         action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
         after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
-        return after, (state, raw)
+        return after, (state, outputs, raw)
 
-    last, (states, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
-    return Trajectory(jnp.concatenate([states, feature(last)[None]]), actions)
+    last, (states, outputs, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
+    return Trajectory(jnp.concatenate([states, feature(last)[None]]), outputs, actions)
 
 
 def actor_critic_losses(
@@ -99,9 +108,9 @@ def actor_critic_losses(
     """
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
-    acting = {**frozen, "actor": params["actor"]} if through_model else frozen
+    acting = {**frozen, "actor": params["actor"]}
     start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
-    imagined = imagine(nets, acting, key, start, config.horizon)
+    imagined = imagine(nets, acting, key, start, config.horizon, through_model)
     states = jax.lax.stop_gradient(imagined.feature)
 
     bins = symexp_bins(nets.heads.bins)
@@ -121,13 +130,15 @@ def actor_critic_losses(
         *update_percentiles(scale.low, scale.high, returns, config.return_decay, config.return_percentiles)
     )
     divisor = return_scale(scale.low, scale.high, config.return_floor)
-    distribution = policy(nets.heads, nets.spec.action, nets.apply("actor", params, states[:-1]))
+    # The entropy's gradient goes to the actor at its own state, never through the states before.
+    outputs = nets.apply("actor", params, states[:-1]) if through_model else imagined.policy
+    distribution = policy(nets.heads, nets.spec.action, outputs)
     entropy = steps_last(distribution.entropy())
     if through_model:
         actor = dynamics_loss(returns / divisor, entropy, weight, config.entropy)
     else:
         advantage = (returns - value[:, :-1]) / divisor
-        log_prob = steps_last(distribution.log_prob(jax.lax.stop_gradient(imagined.action)))
+        log_prob = steps_last(distribution.log_prob(imagined.action))
         actor = reinforce_loss(log_prob, advantage, entropy, weight, config.entropy)
 
     slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)

@@ -83,16 +83,16 @@ def cue(delay: int = 4) -> Probe:
 
 
 def target(length: int = 4) -> Probe:
-    """Each step shows a number in [-1, 1]; the return is 1 minus the mean distance of the actions from them.
+    """An episode shows a number in [-1, 1]; the return is 1 minus the mean distance of the actions from it.
 
     Blind: the best constant action, 0, has 0.5.
     """
 
     def step(state: State, action: Array) -> tuple[Array, Array]:
-        return state.memory, (1.0 - jnp.abs(action[0] - state.memory[state.t])) / length
+        return state.memory, (1.0 - jnp.abs(action[0] - state.memory[0])) / length
 
-    first = lambda key: jax.random.uniform(key, (length + 1,), minval=-1.0, maxval=1.0)
-    return Probe(make(length, length + 1, first, lambda state: vector(state.memory[state.t]), step), length, 1.0, 0.5)
+    first = lambda key: jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+    return Probe(make(length, 1, first, lambda state: vector(state.memory[0]), step), length, 1.0, 0.5)
 
 
 def echo(length: int = 8) -> Probe:
