@@ -95,7 +95,6 @@ def quickstart(size: str) -> Config:
     base = agent_config(size)
     agent = replace(
         base,
-        heads=replace(base.heads, bins=63),
         objective=NextEmbedding(PredictorConfig(layers=1, width=128, feedforward=256)),
         behavior=BehaviorConfig(horizon=10, discount=0.98, entropy=1e-3, return_floor=0.1),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
