@@ -144,6 +144,46 @@ def test_one_step_from_dm_controls_state_gives_its_reward_and_observation(name):
         assert np.quantile(errors, 0.9) < 1e-3, key
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted({name.split("_")[0]: name for name in NAMES}.values()))
+def test_in_64_bits_one_step_is_dm_controls(name):
+    """So that what is left in 32 bits is rounding: the same physics, task by task."""
+    code = (
+        "import jax\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        "from benchmarks import dmc_equality as equality\n"
+        f"row = equality.measure({name!r}, steps=500, free_steps=0, runs=50, resets=0, episodes=0)\n"
+        "print(row.reward_error, row.obs_error)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], check=True, timeout=600, capture_output=True, text=True)
+    reward, obs = map(float, run.stdout.split())
+    assert reward < 1e-7
+    assert obs < 1e-7
+
+
+def test_contacts_of_short_capsules_have_mujocos_normals():
+    """The ball beside a wall of the cup, which is 5 cm long: MJX alone tilts this normal by 4e-4."""
+    simulation = task_of("dmc/ball_in_cup_catch").simulation
+    data = mujoco.MjData(simulation.mj_model)
+    data.qpos[:] = [0.0, 0.0, 0.0, 0.3]
+    wall = simulation.mj_model.geom("cup_part_0").id
+    mujoco.mj_kinematics(simulation.mj_model, data)
+    ball = simulation.mj_model.geom("ball").id
+    # Into the wall's side, a third of the way along it.
+    along = data.geom_xmat[wall].reshape(3, 3)[:, 2]
+    place = data.geom_xpos[wall] + simulation.mj_model.geom_size[wall, 1] / 3 * along
+    place = place + np.array([0.03, 0, 0]) - data.geom_xpos[ball]
+    data.qpos[2:] += place[[0, 2]]
+    mujoco.mj_forward(simulation.mj_model, data)
+    pair = [set(contact.geom) == {ball, wall} for contact in data.contact]
+    assert sum(pair) == 1
+    expected = data.contact.frame[pair.index(True)].reshape(3, 3)[0]
+    start = simulation.initial().replace(qpos=jnp.asarray(data.qpos, jnp.float32))
+    contact = jax.jit(simulation.settle)(start)._impl.contact
+    found = [set(np.asarray(geom)) == {ball, wall} for geom in contact.geom]
+    np.testing.assert_allclose(contact.frame[found.index(True)][0], expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", QUICK)
 def test_a_whole_episode_runs_along_with_dm_control(name):
     """Same start, same actions: the same 500 rewards and observations, and the last flag on the same step."""

@@ -25,6 +25,7 @@ from ne_dreamer_jax.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that its optional Warp backend is not installed
     from mujoco import mjx
+    from mujoco.mjx._src import math as mjx_math
 
 Integrated = dict[str, Array]
 """The fields of ``mjx.Data`` that an integrator changes. With the controls, all others follow from them."""
@@ -52,16 +53,32 @@ def suite_directory() -> Path:
     return Path(found.origin).parent / "suite"
 
 
+def _closest_segment_point(a: Array, b: Array, point: Array) -> Array:
+    """The point of the segment from ``a`` to ``b`` that is closest to ``point``, all [3]."""
+    along = b - a
+    squared = jnp.dot(along, along)
+    share = jnp.dot(point - a, along) / jnp.where(squared > 0, squared, 1)
+    return a + jnp.clip(share, 0, 1) * along
+
+
 @contextlib.contextmanager
 def _mjx_numerics() -> Iterator[None]:
     """What MJX is traced under, whatever the caller's configuration.
 
     It relies on implicit promotion, and its solver on float32 products: the three digits of TensorFloat-32, a GPU's
     default, would take its trajectories away from MuJoCo's.
+
+    Its own closest point of a segment adds 1e-6 to the squared length that it divides by. For capsules of a few
+    centimetres that turns the normals of contacts by up to 5e-4, and changes velocities as much.
     """
     promotion = (jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"))
-    with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
-        yield
+    theirs = mjx_math.closest_segment_point
+    mjx_math.closest_segment_point = _closest_segment_point
+    try:
+        with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
+            yield
+    finally:
+        mjx_math.closest_segment_point = theirs
 
 
 @dataclasses.dataclass(frozen=True)
