@@ -28,15 +28,29 @@ from ne_dreamer_jax import envs
 @click.option("--action-repeat", type=click.IntRange(1), default=2, show_default=True)
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Agent steps in a timed call.")
 @click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
+@click.option("--mjx", "with_mjx", is_flag=True, help="Beside each dmc task, MJX's own step on the same model.")
 def main(
-    tasks: tuple[str, ...], counts: tuple[int, ...], obs: str, action_repeat: int, steps: int, rounds: int
+    tasks: tuple[str, ...],
+    counts: tuple[int, ...],
+    obs: str,
+    action_repeat: int,
+    steps: int,
+    rounds: int,
+    with_mjx: bool,
 ) -> None:
     """Agent steps a second of each task, and what its first call, compilation included, takes."""
     quiet()
     from benchmarks import common
 
-    runs = {f"{task} x {n}": (task, n) for task in dict.fromkeys(tasks) for n in dict.fromkeys(counts)}
-    cases = {name: _rollout(task, n, obs, action_repeat, steps) for name, (task, n) in runs.items()}
+    runs: dict[str, tuple[str, int]] = {}
+    cases: dict[str, Callable[[], Any]] = {}
+    for task in dict.fromkeys(tasks):
+        for n in dict.fromkeys(counts):
+            runs[name := f"{task} x {n}"] = (task, n)
+            cases[name] = _rollout(task, n, obs, action_repeat, steps)
+            if with_mjx and task.startswith("dmc/"):
+                runs[name := f"{task} x {n}, mjx.step"] = (task, n)
+                cases[name] = _mjx_steps(task, n, action_repeat, steps)
     measured = common.measure(cases, rounds=rounds)
     columns: dict[str, dict[str, Any]] = {
         name: {
@@ -71,6 +85,37 @@ def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int)
     def case() -> Any:
         if not held:
             held.append(jax.jit(jax.vmap(env.prepare))(jax.random.split(jax.random.key(0), num_envs)))
+        held[0], outputs = compiled(held[0], jax.random.key(1))
+        return outputs
+
+    return case
+
+
+def _mjx_steps(task: str, num_envs: int, action_repeat: int, steps: int) -> Callable[[], Any]:
+    """The same number of physics steps with nothing around them: no rewards, observations, limits or resets."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    from ne_dreamer_jax.envs import dmc, registry
+
+    simulation = dmc.load(*registry.split_dmc(task)).simulation
+
+    def run(data: Any, key: jax.Array) -> Any:
+        def step(data: Any, key: jax.Array) -> tuple[Any, Any]:
+            action = jax.random.uniform(key, data.ctrl.shape, jnp.float32, -1.0, 1.0)
+            turn = lambda _, data: jax.vmap(lambda data: mjx.step(simulation.model, data))(data)
+            data = jax.lax.fori_loop(0, action_repeat * simulation.n_sub_steps, turn, data.replace(ctrl=action))
+            return data, data.qpos
+
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return jax.lax.scan(step, data, jax.random.split(key, steps))
+
+    compiled = jax.jit(run)
+    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *x.shape)), simulation.initial())
+    held = [start]
+
+    def case() -> Any:
         held[0], outputs = compiled(held[0], jax.random.key(1))
         return outputs
 
