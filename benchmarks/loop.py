@@ -74,7 +74,11 @@ def _parts(config: Any) -> dict[str, Callable[[], Any]]:
 
     options, n = config.env, config.loop.num_envs
     make = lambda obs: nedreamer.envs.make(
-        options.task, obs=obs, action_repeat=options.action_repeat, image_size=options.image_size
+        options.task,
+        obs=obs,
+        action_repeat=options.action_repeat,
+        image_size=options.image_size,
+        fast=options.fast,
     )
     blind, seeing = make("vector"), make("pixels")
     agent = nedreamer.make_agent(config.agent, seeing.spec)

@@ -28,6 +28,7 @@ from ne_dreamer_jax import envs
 @click.option("--action-repeat", type=click.IntRange(1), default=2, show_default=True)
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Agent steps in a timed call.")
 @click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
+@click.option("--fast", is_flag=True, help="Beside each dmc task, itself with a shorter line search.")
 @click.option("--mjx", "with_mjx", is_flag=True, help="Beside each dmc task, MJX's own step on the same model.")
 def main(
     tasks: tuple[str, ...],
@@ -36,6 +37,7 @@ def main(
     action_repeat: int,
     steps: int,
     rounds: int,
+    fast: bool,
     with_mjx: bool,
 ) -> None:
     """Agent steps a second of each task, and what its first call, compilation included, takes."""
@@ -48,6 +50,9 @@ def main(
         for n in dict.fromkeys(counts):
             runs[name := f"{task} x {n}"] = (task, n)
             cases[name] = _rollout(task, n, obs, action_repeat, steps)
+            if fast and task.startswith("dmc/"):
+                runs[name := f"{task} x {n}, fast"] = (task, n)
+                cases[name] = _rollout(task, n, obs, action_repeat, steps, fast=True)
             if with_mjx and task.startswith("dmc/"):
                 runs[name := f"{task} x {n}, mjx.step"] = (task, n)
                 cases[name] = _mjx_steps(task, n, action_repeat, steps)
@@ -64,13 +69,13 @@ def main(
     common.report("rollout", measured, settings=settings, columns=columns)
 
 
-def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int) -> Callable[[], Any]:
+def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int, **options: Any) -> Callable[[], Any]:
     """A function that goes on for some steps from where its last call left off. Its first call compiles it."""
     import jax
 
     from ne_dreamer_jax.envs import conformance
 
-    env = envs.make(task, obs=obs, action_repeat=action_repeat)
+    env = envs.make(task, obs=obs, action_repeat=action_repeat, **options)
 
     def run(state: Any, key: jax.Array) -> tuple[Any, Any]:
         def step(state: Any, key: jax.Array) -> tuple[Any, Any]:

@@ -57,7 +57,11 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
     """
     options = config.env
     env = env or nedreamer.envs.make(
-        options.task, obs=options.obs, action_repeat=options.action_repeat, image_size=options.image_size
+        options.task,
+        obs=options.obs,
+        action_repeat=options.action_repeat,
+        image_size=options.image_size,
+        fast=options.fast,
     )
     agent = nedreamer.make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, options.action_repeat, mesh)

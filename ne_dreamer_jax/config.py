@@ -47,6 +47,8 @@ class EnvConfig:
     """Environment steps for which each action is held; rewards are summed."""
     image_size: int = 64
     """Height and width of the frames."""
+    fast: bool = False
+    """Whether contacts are solved with a shorter line search than MuJoCo's; benchmarks/DMC.md measures the error."""
 
 
 @dataclass(frozen=True)

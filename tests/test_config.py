@@ -508,7 +508,7 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
         return counting.env(image=False)
 
     monkeypatch.setattr(envs, "make", make)
-    changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48"}
+    changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48", "fast": "true"}
     assert set(changes) == {field.name for field in fields(EnvConfig)}
     base = training.build(BASE).loop
     for name, value in changes.items():

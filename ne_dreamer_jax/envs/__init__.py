@@ -19,7 +19,7 @@ def make(name: str, **options: Any) -> Env:
     """Makes the environment called ``name``, e.g. ``"dmc/walker_walk"``.
 
     Options of DMC tasks (see ``envs.dmc.make``): ``obs="pixels" | "vector" | "both"``, ``action_repeat=2``,
-    ``image_size=64``.
+    ``image_size=64``, ``fast=False``.
 
     Raises:
       ValueError: no environment has that name (the message names close matches), or an option has a bad value.

@@ -145,6 +145,20 @@ def test_one_step_from_dm_controls_state_gives_its_reward_and_observation(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["dmc/walker_walk", "dmc/hopper_hop"])
+def test_the_shorter_line_search_costs_next_to_no_accuracy(name):
+    recording, errors = equality.record(name, 100), {}
+    for fast in (False, True):
+        task = equality.load_task(name, fast)
+        assert (task.simulation.model.opt.ls_iterations < task.simulation.mj_model.opt.ls_iterations) == fast
+        _, obs = equality.one_step_errors(equality.Player(task), recording)
+        errors[fast] = np.stack(list(obs.values()))
+    assert not np.array_equal(errors[True], errors[False])
+    assert np.quantile(errors[True], 0.95) < 2 * np.quantile(errors[False], 0.95)
+    assert errors[True].max() < 1e-2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({name.split("_")[0]: name for name in NAMES}.values()))
 def test_in_64_bits_one_step_is_dm_controls(name):
     """So that what is left in 32 bits is rounding: the same physics, task by task."""

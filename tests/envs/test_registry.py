@@ -57,6 +57,7 @@ def test_a_name_like_no_other_is_refused_with_the_list():
         ({"obs": "pixel"}, r"obs to be one of pixels, vector, both, got 'pixel'"),
         ({"action_repeat": 0}, r"action_repeat to be a positive int, got 0"),
         ({"image_size": 64.0}, r"image_size to be a positive int, got 64\.0"),
+        ({"fast": 1}, r"fast to be True or False, got 1"),
     ],
 )
 def test_bad_options_are_refused(options, message):

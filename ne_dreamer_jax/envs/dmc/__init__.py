@@ -34,7 +34,9 @@ def make(domain: str, task: str, **options: Any) -> base.Env:
     return from_task(load(domain, task), **options)
 
 
-def from_task(task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> base.Env:
+def from_task(
+    task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64, fast: bool = False
+) -> base.Env:
     """Makes an environment of a task, one's own included. Its ``env_state.physics`` is the ``mjx.Data``.
 
     Args:
@@ -44,19 +46,24 @@ def from_task(task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_
         (dm_control's, under its names), float32; ``"both"``.
       action_repeat: control steps per step; their rewards are added up.
       image_size: height and width of the image in pixels.
+      fast: solve constraints with a shorter line search than MuJoCo's, `Simulation.fast`.
 
     Raises:
       ValueError: an option has a bad value, an actuator has no range, or the picture needs what the renderer does
         not draw (the message names it).
     """
-    _check(obs=obs, action_repeat=action_repeat, image_size=image_size)
+    _check(obs=obs, action_repeat=action_repeat, image_size=image_size, fast=fast)
+    if fast:
+        task = task._replace(simulation=task.simulation.fast())
     return base.from_core(environment.make_core(task, obs, action_repeat, image_size))
 
 
-def _check(obs: str = "pixels", action_repeat: int = 2, image_size: int = 64) -> None:
+def _check(obs: str = "pixels", action_repeat: int = 2, image_size: int = 64, fast: bool = False) -> None:
     """Raises ValueError for bad options, before a model is loaded."""
     if obs not in _OBSERVATIONS:
         raise ValueError(f"expected obs to be one of {', '.join(_OBSERVATIONS)}, got {obs!r}")
     for name, value in (("action_repeat", action_repeat), ("image_size", image_size)):
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"expected {name} to be a positive int, got {value!r}")
+    if not isinstance(fast, bool):
+        raise ValueError(f"expected fast to be True or False, got {fast!r}")
