@@ -11,7 +11,8 @@ from scipy import stats
 
 from ne_dreamer_jax import behavior, world_model
 from ne_dreamer_jax.behavior import BehaviorConfig
-from ne_dreamer_jax.losses import symexp_bins
+from ne_dreamer_jax.losses import lambda_returns, return_scale, symexp_bins, twohot_mean, update_percentiles
+from ne_dreamer_jax.nets.heads import policy
 from ne_dreamer_jax.nets.rssm import RSSM
 from ne_dreamer_jax.types import Latent, ReturnScale
 from tests import tiny
@@ -163,6 +164,43 @@ WHAT_TRAINS_WHAT = {"actor": {"actor"}, "critic": {"critic"}, "replay_critic": {
 def test_imagined_losses_train_actor_and_critic_alone_and_the_replayed_one_the_model_too(reinforce):
     assert tuple(reinforce.out[0]) == behavior.LOSSES
     assert trained(reinforce.gradients) == WHAT_TRAINS_WHAT
+
+
+@pytest.mark.parametrize("spec", [tiny.VECTORS, tiny.DISCRETE], ids=["continuous", "discrete"])
+def test_the_score_functions_gradient_is_that_of_one_batched_actor_on_frozen_trajectories(spec):
+    model = make(spec, CONFIG)
+    nets = model.nets
+
+    @jax.jit
+    def run(params):
+        def actor_loss(params):
+            losses, (_, rollout) = model.compute(params, model.slow, model.batch, KEY)
+            return losses["actor"], rollout
+
+        gradient, rollout = jax.grad(actor_loss, has_aux=True)(params)
+        _, trajectory = frozen_trajectory(nets, params, rollout, KEY)
+        time_last = lambda x: jnp.swapaxes(x, 0, 1)
+        bins = symexp_bins(15)
+        mean = lambda head: time_last(twohot_mean(nets.apply(head, params, trajectory.feature), bins))
+        go_on = time_last(jax.nn.sigmoid(nets.apply("continue", params, trajectory.feature)[..., 0]))
+        returns = lambda_returns(mean("reward"), mean("critic"), go_on, CONFIG.lam)
+        low, high = update_percentiles(*OLD_SCALE, returns, CONFIG.return_decay, CONFIG.return_percentiles)
+        advantage = (returns - mean("critic")[:, :-1]) / return_scale(low, high)
+        weight = jnp.cumprod(go_on, axis=1)[:, :-1]
+
+        def loss(actor):
+            outputs = nets.apply("actor", {"actor": actor}, trajectory.feature[:-1])
+            distribution = policy(nets.heads, spec.action, outputs)
+            log_prob = time_last(distribution.log_prob(trajectory.action))
+            return jnp.mean(-weight * (advantage * log_prob + CONFIG.entropy * time_last(distribution.entropy())))
+
+        outputs = nets.apply("actor", params, trajectory.feature[:-1])
+        return gradient["actor"], jax.grad(loss)(params["actor"]), trajectory.policy, outputs
+
+    got, want, outputs, expected = run(model.params)
+    np.testing.assert_allclose(outputs, expected, rtol=1e-4, atol=1e-5)
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4 * np.abs(y).max())
 
 
 @pytest.mark.parametrize("spec", [tiny.VECTORS, tiny.DISCRETE], ids=["continuous", "discrete"])

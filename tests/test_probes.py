@@ -71,6 +71,10 @@ LEARNERS: dict[str, Any] = {
 PICTURES = {"dreamerpro"}
 """They need images."""
 
+SOLVED = {"target": 0.7}
+"""Share of the way from blind to optimal that counts as solved, where it isn't 0.8: a number has to pass through
+latents of which each step has one nat for nothing."""
+
 UNABLE = {("drqv2", "cue"): "it sees three frames and remembers nothing"}
 
 
@@ -162,8 +166,7 @@ def test_who_should_solve_a_probe_does_and_who_lacks_the_ability_does_not(method
     if (method, name) in UNABLE:
         assert reached < probe.blind + 0.1, f"expected not to solve it: {UNABLE[method, name]}"
     else:
-        # Not 0.8: what a latent tells of the target's number is about the one free nat, three levels of it.
-        assert reached > probe.blind + 0.7 * (probe.optimum - probe.blind)
+        assert reached > probe.blind + SOLVED.get(name, 0.8) * (probe.optimum - probe.blind)
 
 
 @pytest.mark.slow

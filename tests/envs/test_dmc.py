@@ -161,7 +161,7 @@ def test_the_shorter_line_search_costs_next_to_no_accuracy(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({name.split("_")[0]: name for name in NAMES}.values()))
 def test_in_64_bits_one_step_is_dm_controls(name):
-    """So that what is left in 32 bits is rounding: the same physics, task by task."""
+    """So that what is left in 32 bits is rounding: the same physics, domain by domain."""
     code = (
         "import jax\n"
         "jax.config.update('jax_enable_x64', True)\n"
