@@ -153,7 +153,6 @@ def test_the_shorter_line_search_costs_next_to_no_accuracy(name):
         assert (task.simulation.model.opt.ls_iterations < task.simulation.mj_model.opt.ls_iterations) == fast
         _, obs = equality.one_step_errors(equality.Player(task), recording)
         errors[fast] = np.stack(list(obs.values()))
-    assert not np.array_equal(errors[True], errors[False])
     assert np.quantile(errors[True], 0.95) < 2 * np.quantile(errors[False], 0.95)
     assert errors[True].max() < 1e-2
 
