@@ -15,6 +15,7 @@ from benchmarks import dmc_equality as equality
 from ne_dreamer_jax import envs
 from ne_dreamer_jax.envs import conformance, registry
 from ne_dreamer_jax.envs.dmc import Task, environment
+from ne_dreamer_jax.envs.dmc import simulation as stepping
 from ne_dreamer_jax.envs.dmc.simulation import mjx
 
 NAMES = [name for name in envs.names() if name.startswith("dmc/")]
@@ -142,6 +143,17 @@ def test_one_step_from_dm_controls_state_gives_its_reward_and_observation(name):
     for key, errors in obs.items():
         assert np.median(errors) < 1e-4, key
         assert np.quantile(errors, 0.9) < 1e-3, key
+
+
+@pytest.mark.slow
+def test_a_line_search_that_ends_gives_the_bits_of_one_that_takes_all_its_turns(monkeypatch):
+    name = "dmc/hopper_hop"
+    recording, played = equality.record(name, 100), []
+    for replaced in (stepping._INSTEAD, stepping._INSTEAD[:1]):  # the second leaves MJX its own search
+        monkeypatch.setattr(stepping, "_INSTEAD", replaced)
+        player = equality.Player(equality.load_task(name))
+        played.append(player.play(recording.start, recording.episode, recording.action[None]))
+    jax.tree.map(np.testing.assert_array_equal, *played)
 
 
 @pytest.mark.slow
