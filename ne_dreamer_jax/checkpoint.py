@@ -5,24 +5,22 @@ else, so that an evaluation never reads the replay)::
 
     checkpoints/000000123456/        one checkpoint; the number is the step it was saved at
       manifest.json                  step, score, the caller's notes; of each item: the name, shape, dtype and SHA-256
-                                     of every array; and a SHA-256 of all that
+                                     of every array, and the SHA-256 of every file; and a SHA-256 of all that
       agent/  loop/                  the items, written by Orbax
 
-Orbax loads an array with flipped bits, and casts one of another dtype, without a word. So every array is checked
-against the manifest after it was read, and what is to be read is compared with what is expected before. A checkpoint
-is written beside its place and moved there when it is whole and on disk: what a crash cuts short is never seen. One
-that was damaged later is passed over for the one before it.
+Orbax loads an array with flipped bits, and casts one of another dtype, without a word. So an item's files are checked
+against the manifest before Orbax opens them, its arrays after, and what is to be read is compared with what is
+expected. A checkpoint is written beside its place and moved there when it is whole and on disk: what a crash cuts
+short is never seen. One that was damaged later is passed over for the one before it.
 """
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import json
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -31,7 +29,7 @@ import jax
 import numpy as np
 
 MANIFEST = "manifest.json"
-FORMAT = 1
+FORMAT = 2
 _PARTIAL = ".partial-"
 
 
@@ -47,6 +45,7 @@ class Checkpoint(NamedTuple):
     score: float | None  # the evaluation return at this step, where there was an evaluation
     notes: dict[str, Any]  # what the caller wished to keep beside it
     items: dict[str, dict[str, dict[str, Any]]]  # item -> name of an array -> shape, dtype, sha256
+    files: dict[str, dict[str, str]]  # item -> path of a file in the item's folder -> sha256
 
 
 class Restored(NamedTuple):
@@ -82,7 +81,7 @@ def save(
     _remove_partial(directory)
     partial = directory / f"{_PARTIAL}{step:012d}"
     partial.mkdir()
-    described = {}
+    described, files = {}, {}
     for item, tree in items.items():
         arrays = _flatten(tree)
         described[item] = {name: _describe(array) | _evidence(array) for name, array in arrays.items()}
@@ -91,12 +90,14 @@ def save(
             with _checkpointer() as checkpointer:
                 checkpointer.save((partial / item).absolute(), stored)
                 checkpointer.wait_until_finished()  # where an error of writing comes out
+        files[item] = _digest_files(partial / item)
     content = {
         "format": FORMAT,
         "step": step,
         "score": None if score is None or not math.isfinite(score) else float(score),
         "notes": dict(notes or {}),
         "items": described,
+        "files": files,
     }
     _write_manifest(partial, content)
     for path in [*partial.rglob("*"), partial]:
@@ -180,7 +181,8 @@ def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Co
         dropped = [item for item in checkpoint.items if item not in of_best]
         if dropped:
             items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}
-            kept = checkpoint._replace(items=items)._asdict()
+            files = {item: checkpoint.files[item] for item in items}
+            kept = checkpoint._replace(items=items, files=files)._asdict()
             del kept["path"]
             _write_manifest(checkpoint.path, {"format": FORMAT, **kept})
         for item in dropped:
@@ -286,6 +288,39 @@ def _digest(array: Any) -> str:
     return hashlib.sha256(data.reshape(-1).view(np.uint8)).hexdigest()
 
 
+def _digest_files(folder: Path) -> dict[str, str]:
+    """Path of each file in the folder -> its SHA-256; nothing where the folder is missing.
+
+    Raises:
+      OSError: a file can't be read.
+    """
+    digests = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            digests[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
+
+
+def _check_files(checkpoint: Checkpoint, item: str) -> None:
+    """Raises DamagedError where a file of the item is not as it was saved, is gone, or has been added.
+
+    It comes before Orbax, which reads several arrays at once: when one of them can't be read, it drops the others
+    unfinished, and Python warns of those at any time later.
+    """
+    folder = checkpoint.path / item
+    try:
+        found = _digest_files(folder)
+    except OSError as error:
+        raise DamagedError(f"{folder} can't be read: {error}.") from error
+    saved = checkpoint.files[item]
+    different = [name for name in dict.fromkeys([*saved, *found]) if saved.get(name) != found.get(name)]
+    if different:
+        name = different[0]
+        fault = "is missing" if name not in found else "is not as it was saved" if name in saved else "was added"
+        more = f", and {len(different) - 1} more files like that" if len(different) > 1 else ""
+        raise DamagedError(f"{folder} is damaged: {name} {fault}{more}.")
+
+
 def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
     expected = {name: _describe(leaf) for name, leaf in _flatten(like).items()}
     got = {name: {key: leaf[key] for key in ("shape", "dtype")} for name, leaf in checkpoint.items[item].items()}
@@ -312,8 +347,12 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
         sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
         return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
 
+    _check_files(checkpoint, item)
     stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape)}
-    read = _read(checkpoint.path / item, stored) if stored else {}
+    read: dict[str, jax.Array] = {}
+    if stored:
+        with _checkpointer() as checkpointer:
+            read = checkpointer.restore((checkpoint.path / item).absolute(), stored)
     leaves = []
     for name, leaf in expected.items():
         saved = checkpoint.items[item][name]
@@ -335,17 +374,3 @@ def _checkpointer() -> Any:
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
     )
     return ocp.StandardCheckpointer(multiprocessing_options=options)
-
-
-def _read(path: Path, like: dict[str, jax.ShapeDtypeStruct]) -> dict[str, jax.Array]:
-    try:
-        with _checkpointer() as checkpointer:
-            return checkpointer.restore(path.absolute(), like)
-    except Exception as error:  # whatever Orbax and TensorStore say of files that are cut, gone or scrambled
-        first_line = next(iter(str(error).strip().splitlines()), "")
-        reason = f"{path} can't be read: {type(error).__name__}: {first_line[:200]}."
-    # What Orbax had begun is dropped here and now, since Python warns of it whenever that happens.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
-        gc.collect()
-    raise DamagedError(reason)
