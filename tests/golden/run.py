@@ -21,6 +21,7 @@ from ne_dreamer_jax import envs, make_agent
 from ne_dreamer_jax import replay as replays
 from ne_dreamer_jax.agent import AgentConfig
 from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.drqv2 import DrQv2Config
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
@@ -33,12 +34,14 @@ HERE = Path(__file__).parent
 REPLAY, LOSSES = HERE / "replay.npz", HERE / "losses.npz"
 TASK, SIDE, ENVS, STEPS = "dmc/cartpole_swingup", 16, 4, 96
 UPDATES = 200
-METHODS = tuple(name for name in configs.METHODS if "/" not in name)
+METHODS = (*(name for name in configs.METHODS if "/" not in name), "drqv2")
 FLAGS = ("is_first", "is_last", "is_terminal")
 
 
-def config(method: str) -> AgentConfig:
+def config(method: str) -> AgentConfig | DrQv2Config:
     """The very small agent of a method."""
+    if method == "drqv2":
+        return DrQv2Config(batch_size=32, channels=8, features=8, units=32, learning_rate=1e-3, shift=1)
     agent = AgentConfig(
         encoder=EncoderConfig(depth=4, multipliers=(2, 2), layers=1, units=16),
         rssm=RSSMConfig(deter=64, stoch=8, classes=4, hidden=16, blocks=4, prior_layers=1),
@@ -74,19 +77,19 @@ def collect() -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in data.items()}
 
 
-def load(agent: AgentConfig) -> tuple[EnvSpec, replays.Replay]:
+def load(agent: AgentConfig | DrQv2Config) -> tuple[EnvSpec, replays.Replay]:
     """The stored replay as a ring that is full, with zero latents, and the environment's spec."""
     with np.load(REPLAY) as file:
         data = {name: jnp.asarray(file[name]) for name in file.files}
     obs = {name.removeprefix("obs/"): x for name, x in data.items() if name.startswith("obs/")}
-    rssm = agent.rssm
-    latent = Latent(jnp.zeros((STEPS, ENVS, rssm.deter)), jnp.zeros((STEPS, ENVS, rssm.stoch), jnp.uint8))
+    deter, stoch, classes = agent.latent_sizes
+    latent = Latent(jnp.zeros((STEPS, ENVS, deter)), jnp.zeros((STEPS, ENVS, stoch), jnp.uint8))
     flags = [data[name] for name in FLAGS]
     ring = replays.Replay(
         Transition(obs, data["action"], data["reward"], *flags, latent),
         jnp.zeros((), jnp.int32),
         jnp.asarray(STEPS, jnp.int32),
-        rssm.classes,
+        classes,
     )
     observation = {name: ArraySpec(x.shape[2:], x.dtype) for name, x in obs.items()}
     return EnvSpec(observation, ContinuousAction(data["action"].shape[-1])), ring
