@@ -9,11 +9,15 @@ from typing import Any
 import jax
 
 from ne_dreamer_jax import checkpoint, metrics, parallel
+from ne_dreamer_jax.host_frames import HostFrames
 from ne_dreamer_jax.loop import LoopState
 from ne_dreamer_jax.metrics import Counters
 from ne_dreamer_jax.run_directory import RunDirectory
 
-WHOLE = ("agent", "loop")  # the items of a checkpoint from which training goes on
+
+def whole(frames: HostFrames | None) -> tuple[str, ...]:
+    """The items of a checkpoint from which training goes on; ``frames`` are those of the loop."""
+    return ("agent", "loop") if frames is None else ("agent", "loop", "frames")
 
 
 class Record:
@@ -45,8 +49,11 @@ class Record:
 class Saves:
     """Checkpoints: whole ones in intervals of time, and the agent alone where an evaluation is the best so far."""
 
-    def __init__(self, files: RunDirectory, seconds: float, echo: Callable[[str], None]) -> None:
+    def __init__(
+        self, files: RunDirectory, seconds: float, echo: Callable[[str], None], frames: HostFrames | None = None
+    ) -> None:
         self._directory, self._seconds, self._echo = files.checkpoints, seconds, echo
+        self._frames, self._items = frames, whole(frames)
         self._last = time.monotonic()
 
     def due(self) -> bool:
@@ -57,7 +64,10 @@ class Saves:
         """Saves everything, unless it stands there already."""
         if parallel.agreed(not any(found.score == score for found in self._whole_at(counters)))[0]:
             rest: Any = ()
-            self._save({"agent": state.train, "loop": state._replace(train=rest)}, counters, score)
+            items: dict[str, Any] = {"agent": state.train, "loop": state._replace(train=rest)}
+            if self._frames is not None:
+                items["frames"] = self._frames.arrays
+            self._save(items, counters, score)
         self._last = time.monotonic()
 
     def if_best(self, state: LoopState, counters: Counters, score: float) -> None:
@@ -72,7 +82,7 @@ class Saves:
 
     def _whole_at(self, counters: Counters) -> list[checkpoint.Checkpoint]:
         found = checkpoint.checkpoints(self._directory)
-        return [entry for entry in found if entry.step == counters.env_step and set(WHOLE) <= set(entry.items)]
+        return [entry for entry in found if entry.step == counters.env_step and set(self._items) <= set(entry.items)]
 
     def _save(self, items: dict[str, Any], counters: Counters, score: float | None) -> None:
         began = time.monotonic()
@@ -81,5 +91,5 @@ class Saves:
             if jax.process_index() > 0:
                 return
         checkpoint.save(self._directory, counters.env_step, items, score=score, notes=counters._asdict())
-        checkpoint.prune(self._directory, whole=WHOLE)
+        checkpoint.prune(self._directory, whole=self._items)
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

@@ -20,7 +20,7 @@ from jax.sharding import Mesh
 
 import ne_dreamer_jax as nedreamer
 from experiments import plots, progress, video
-from experiments.record import WHOLE, Record, Saves
+from experiments.record import Record, Saves, whole
 from experiments.schedule import Schedule
 from experiments.stop import Stop
 from ne_dreamer_jax import checkpoint, compile_cache, metrics, parallel
@@ -90,7 +90,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     state, lines = _start(run, files, start_key, echo)
     counters = schedule.counters(state)
     pace = progress.Pace(schedule)
-    saves = Saves(files, 60 * checkpoint_minutes, echo)
+    saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
     chunk: Any = None
     frames = None
     first = jax.process_index() == 0
@@ -131,7 +131,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
             return 128 + stopped_by
     if not first:
         return 0
-    checkpoint.prune(files.checkpoints, whole=WHOLE, keep=1)  # nothing will go on from here
+    checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
     if "image" in run.agent.spec.observation and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
@@ -180,7 +180,9 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     shapes, first = run.shapes, jax.process_index() == 0
     if jax.process_count() > 1:  # each reads the whole and keeps its share
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
-    like = {"agent": shapes.train, "loop": shapes._replace(train=())}  # type: ignore[arg-type]
+    like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=())}  # type: ignore[arg-type]
+    if run.loop.frames is not None:
+        like["frames"] = run.loop.frames.shapes()
     began = time.perf_counter()
     try:
         restored = checkpoint.restore(files.checkpoints, like)
@@ -194,6 +196,8 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     env_step = restored.checkpoint.step
     echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
     _same_for_all(files, env_step)
+    if run.loop.frames is not None:
+        run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
     return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if first else []
 

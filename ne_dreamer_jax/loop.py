@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -17,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from ne_dreamer_jax import memory, parallel
+from ne_dreamer_jax import host_frames, memory, parallel
 from ne_dreamer_jax import replay as replay_lib
+from ne_dreamer_jax.host_frames import HostFrames
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
 
 PAPER_CAPACITY = 5_000_000
@@ -53,9 +55,9 @@ class LoopConfig:
     code for DeepMind Control; or both, as the released code for DeepMind Lab."""
     latent_dtype: Literal["float32", "bfloat16"] = "float32"
     """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
-    storage: Literal["pixels", "states"] = "pixels"
-    """What replay keeps of an image: its pixels, or what it is drawn from, which takes a fraction of the memory and is
-    drawn again, to the same bits, whenever it is sampled."""
+    storage: Literal["pixels", "states", "host"] = "pixels"
+    """What replay keeps of an image: its pixels; its state, which takes a fraction of the memory and is drawn again, to
+    the same bits, whenever it is sampled; or its pixels in the host's memory, from where they travel to the device."""
 
 
 class Counters(NamedTuple):
@@ -104,7 +106,7 @@ class Loop(NamedTuple):
     shapes: Callable[[], LoopState]
     """() -> shapes and dtypes of the state and, on a mesh, where each array lies."""
     replay_bytes: int
-    """What replay will allocate, over all devices."""
+    """What replay will allocate, over all devices and, for images, on the host."""
     capacity: int
     """Transitions that replay will hold."""
     chunk_steps: int
@@ -115,6 +117,8 @@ class Loop(NamedTuple):
     """Transitions that are collected before the first update."""
     updates: int
     """Updates of the whole run."""
+    frames: HostFrames | None = None
+    """Where ``loop.storage=host`` keeps images; to be saved and loaded with the state."""
 
 
 def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mesh | None = None) -> Loop:
@@ -124,7 +128,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
       mesh: of `parallel`; environments, replay and batches are divided over its devices. None for one device.
 
     Raises ValueError where the replay can't hold a sequence, or does not fit the memory, or where it is to keep states
-    of an environment whose images can't be drawn again, or where devices can't get equal shares.
+    of an environment whose images can't be drawn again, or images on the host where there are none or several
+    processes, or where devices can't get equal shares.
     """
     n, b, length = config.num_envs, agent.config.batch_size, agent.config.batch_length
     devices = 1 if mesh is None else mesh.size
@@ -157,21 +162,36 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
             "got 'states'."
         )
     pictures = env.pictures if config.storage == "states" else None
+    images = host_frames.images_of(agent.spec) if config.storage == "host" else {}
+    if config.storage == "host" and (not images or jax.process_count() > 1):
+        got = "several processes" if images else "an environment without images"
+        raise ValueError(f"loop.storage: expected 'pixels' or 'states' for {got}, got 'host'.")
+    frames = HostFrames(capacity // n, n, images) if images else None
 
-    def kept(env_state: Any, obs: Mapping[str, Array]) -> Mapping[str, Array]:
-        """The observation as replay keeps it."""
-        return obs if pictures is None else {**obs, "image": jax.vmap(pictures.record)(env_state)}
+    def kept(env_state: Any, obs: Mapping[str, Array], row: Array) -> Mapping[str, Array]:
+        """The observation as replay keeps it in this row."""
+        if pictures is not None:
+            return {**obs, "image": jax.vmap(pictures.record)(env_state)}
+        if frames is None:
+            return obs
+        put = {
+            name: parallel.per_shard(partial(frames.put, name), (parallel.SPLIT, parallel.SPLIT), parallel.SPLIT)
+            for name in images
+        }
+        return {**obs, **{name: put[name](frames.tickets(row), obs[name]) for name in images}}
 
     def redraw(records: Array) -> Array:
         flat = records.reshape(-1, records.shape[-1])
-        images = jax.lax.map(pictures.redraw, flat, batch_size=min(REDRAWN, len(flat)))  # type: ignore[union-attr]
-        return images.reshape(*records.shape[:2], *images.shape[1:])
+        drawn = jax.lax.map(pictures.redraw, flat, batch_size=min(REDRAWN, len(flat)))  # type: ignore[union-attr]
+        return drawn.reshape(*records.shape[:2], *drawn.shape[1:])
 
     def seen(obs: Mapping[str, Array]) -> Mapping[str, Array]:
         """The inverse of `kept`, for observations [B, T, ...] out of replay."""
-        if pictures is None:
-            return obs
-        return {**obs, "image": parallel.per_shard(redraw, (parallel.SPLIT,), parallel.SPLIT)(obs["image"])}
+        back: dict[str, Callable[[Array], Array]] = {} if pictures is None else {"image": redraw}
+        if frames is not None:
+            back = {name: partial(frames.get, name) for name in images}
+        split = parallel.SPLIT
+        return {**obs, **{name: parallel.per_shard(f, (split,), split)(obs[name]) for name, f in back.items()}}
 
     def transition(timestep: TimeStep, policy: PolicyState, action: Array) -> Transition:
         is_last, is_terminal = timestep.is_last, timestep.is_terminal
@@ -189,7 +209,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
                 name: jnp.zeros((n, *s.shape), s.dtype) for name, s in agent.spec.observation.items()
             }
             no, policy = jnp.zeros((n,), bool), agent.init_policy(n)
-            obs = kept(prepare_envs(jax.random.split(jax.random.key(0), n)), obs)
+            obs = kept(prepare_envs(jax.random.split(jax.random.key(0), n)), obs, jnp.zeros((), jnp.int32))
             return transition(TimeStep(obs, jnp.zeros((n,)), no, no, no), policy, policy.prev_action)
 
         return jax.eval_shape(build)
@@ -201,6 +221,17 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
     )  # the state is on every device, the work divided
     available = int(replay_lib.SHARE * max(0, devices * memory.available() - learner))
     replay_lib.check_capacity(shapes, capacity, n, latent_dtype, available)
+    replay_bytes = replay_lib.nbytes(shapes, capacity, n, latent_dtype)
+    if frames is not None:
+        taken = learner + replay_bytes if jax.default_backend() == "cpu" else 0
+        free = int(replay_lib.SHARE * max(0, memory.host_available() - taken))
+        if frames.nbytes > free:
+            raise ValueError(
+                f"loop.storage: the images of {capacity:,} steps take {memory.readable(frames.nbytes)}, and "
+                f"{memory.readable(free)} of the host are free for them; expected a loop.capacity of at most "
+                f"{free * capacity // frames.nbytes:,} steps"
+            )
+        replay_bytes += frames.nbytes
 
     def make_replay() -> Any:
         return replay_lib.init(shapes, capacity, n, latent_dtype, available)
@@ -254,6 +285,9 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         train, replay, key, sums = carry
         key, sample_key = jax.random.split(key)
         batch = draw_batch(replay, sample_key)
+        if frames is not None:  # the images are read before a later step can be written over them
+            batch, position = jax.lax.optimization_barrier((batch, replay.position))
+            replay = replace(replay, position=position)
         train, latents, metrics = agent.train_step(train, batch)
         if config.write_latents:
             replay = replay_lib.write_latents(replay, batch.index, latents)
@@ -263,7 +297,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         key, act_key, update_key = jax.random.split(state.key, 3)
         env_state, timestep = step_share(state.env, state.policy.prev_action)
         policy, action = agent.act(state.train.params, state.policy, timestep, act_key)
-        step = transition(timestep._replace(obs=kept(env_state, timestep.obs)), policy, action)
+        obs = kept(env_state, timestep.obs, state.replay.position)
+        step = transition(timestep._replace(obs=obs), policy, action)
         replay = replay_lib.add(state.replay, step)
 
         ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
@@ -352,12 +387,13 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         chunk=jax.jit(parallel.traced_on(mesh, chunk), donate_argnums=0, out_shardings=out),
         evaluate=evaluate,
         shapes=shapes_of_state,
-        replay_bytes=replay_lib.nbytes(shapes, capacity, n, latent_dtype),
+        replay_bytes=replay_bytes,
         capacity=capacity,
         chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // max(wage, 1))),
         vector_steps=vector_steps,
         prefill=prefill * n,
         updates=updates,
+        frames=frames,
     )
 
 
@@ -369,7 +405,11 @@ def over_seeds(
     State and metrics have a leading axis R, but for what is the same in all runs: the counters, and how full replay is.
     So each run has its own parameters, environments and replay, and does what it would do alone. ``init`` raises
     ValueError where memory can't hold R replays.
+
+    Raises ValueError for a loop that keeps images on the host, which serve one run.
     """
+    if loop.frames is not None:
+        raise ValueError("loop.storage: expected 'pixels' or 'states' for several seeds at once, got 'host'")
     shapes = loop.shapes()
     axes: Any = jax.tree.map(lambda _: 0, shapes)
     axes = axes._replace(

@@ -17,7 +17,7 @@ def available(device: jax.Device | None = None) -> int:
     stats = None if device.platform == "cpu" else device.memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"] - stats["bytes_in_use"]
-    return _host_available()
+    return host_available()
 
 
 def readable(size: int) -> str:
@@ -30,7 +30,7 @@ def readable(size: int) -> str:
     return f"{value:.1f} TiB"
 
 
-def _host_available(root: Path = Path("/")) -> int:
+def host_available(root: Path = Path("/")) -> int:
     """Bytes a process on this host can still allocate; ``root`` is where its ``proc`` and ``sys`` are mounted."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     meminfo = root / "proc/meminfo"

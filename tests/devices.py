@@ -63,13 +63,15 @@ def placed(loop: loops.Loop, state: Any) -> bool:
 
 
 def environments_and_replay() -> dict[str, Any]:
-    """The whole state of runs on 1, 2 and 8 devices, with pixels and with states in replay."""
+    """The whole state of runs on 1, 2 and 8 devices, with pixels, states and the host's tickets in replay."""
     out: dict[str, Any] = {}
-    for storage, counts in (("pixels", (1, 2, 8)), ("states", (1, 8))):
+    for storage, counts in (("pixels", (1, 2, 8)), ("states", (1, 8)), ("host", (1, 8))):
         loops_ = {devices: stub_loop(devices, storage) for devices in counts}
         states = {devices: ran(loop, loop.init(jax.random.key(0)), STEPS) for devices, loop in loops_.items()}
         out[f"equal, {storage}"] = [same(states[1], states[devices]) for devices in counts[1:]]
         out[f"placed, {storage}"] = [placed(loops_[devices], states[devices]) for devices in counts[1:]]
+        kept = [loop.frames.arrays for loop in loops_.values() if loop.frames is not None]
+        out[f"frames, {storage}"] = all(same(kept[0], other) for other in kept[1:]) and len(kept)
         out["updates"] = int(states[1].train.update)
         shard = states[8].replay.data.obs["image"].addressable_shards[0].data
         out[f"share, {storage}"] = states[8].replay.data.obs["image"].shape[1] / shard.shape[1]

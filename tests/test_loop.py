@@ -237,8 +237,8 @@ def test_more_replays_than_memory_holds_are_refused(monkeypatch):
         init(jax.random.split(jax.random.key(0), 3))
 
 
-def test_states_in_replay_give_the_pixels_back():
-    """The learner's batches are the same to the bit, and replay is smaller by what the images took."""
+def test_states_and_the_host_give_the_pixels_back():
+    """The learner's batches are the same to the bit, and the device's ring (it wraps) is smaller by what they took."""
 
     def last_batch(storage):
         env = counting.env()
@@ -250,17 +250,48 @@ def test_states_in_replay_give_the_pixels_back():
             return learn(state, batch)
 
         agent.train_step = train_step
-        loop = loops.make(dataclasses.replace(CONFIG, storage=storage), env, agent, action_repeat=2)
+        loop = loops.make(dataclasses.replace(CONFIG, storage=storage, capacity=30), env, agent, action_repeat=2)
         ran(loop, STEPS)
         jax.effects_barrier()
         return loop, seen
 
-    (pixels, want), (states, got) = last_batch("pixels"), last_batch("states")
+    (pixels, want), (states, redrawn), (host, fetched) = map(last_batch, ("pixels", "states", "host"))
     assert len(want) == pixels.updates > 3
-    assert_same(got, want)
+    assert_same(redrawn, want)
+    assert_same(fetched, want)
     assert want[0][0].shape == (2, 3, 8, 8, 3)
-    assert states.capacity == pixels.capacity
+    assert states.capacity == host.capacity == pixels.capacity
     assert pixels.replay_bytes - states.replay_bytes == pixels.capacity * (8 * 8 * 3 - 4)
+    assert host.frames.nbytes == pixels.capacity * 8 * 8 * 3
+    assert host.replay_bytes - host.frames.nbytes == states.replay_bytes  # a ticket takes what the counter's state does
+
+
+def test_a_full_ring_on_the_host_keeps_the_newest_images():
+    """Images count the steps of their episode, as the vectors do, so that each row can be told to hold its own."""
+    loop = make(image=True, storage="host", capacity=21)
+    state, _ = ran(loop, STEPS)
+    data = state.replay.data
+    assert int(state.replay.size) == 7 < STEPS
+    tickets = np.asarray(data.obs["image"])
+    np.testing.assert_array_equal(np.sort(tickets, axis=None), np.arange(21))
+    kept = loop.frames.arrays["image"].reshape(21, 8, 8, 3)[tickets]
+    time = np.asarray(data.obs["vector"][..., 1]).astype(np.uint8)
+    np.testing.assert_array_equal(kept, np.broadcast_to(time[..., None, None, None], kept.shape))
+
+
+def test_images_on_the_host_are_refused_where_they_can_not_be(monkeypatch):
+    with pytest.raises(ValueError, match=r"loop.storage: expected 'pixels' or 'states' for an environment without"):
+        make(image=False, storage="host")
+    with pytest.raises(ValueError, match=r"several seeds at once, got 'host'"):
+        loops.over_seeds(make(image=True, storage="host"))
+    loop = make(image=True, storage="host")
+    images, rest = loop.frames.nbytes, loop.replay_bytes - loop.frames.nbytes
+    working = counting.stub(counting.env().spec).working_bytes(None)
+    learner = sum(x.nbytes for x in jax.tree.leaves(loop.shapes().train) if hasattr(x, "nbytes")) + working
+    monkeypatch.setattr(loops.memory, "available", lambda: 2**40)
+    monkeypatch.setattr(loops.memory, "host_available", lambda: int(images / 2 / 0.9) + rest + learner + 200)
+    with pytest.raises(ValueError, match=r"loop.storage: the images of .* expected a loop.capacity of at most"):
+        make(image=True, storage="host")
 
 
 def test_states_are_refused_where_images_cannot_be_drawn_again():

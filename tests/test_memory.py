@@ -23,12 +23,12 @@ def test_an_accelerator_answers_for_itself():
 def test_the_smaller_of_free_memory_and_the_containers_limit_counts(tmp_path, path):
     (tmp_path / "proc").mkdir()
     (tmp_path / "proc/meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:   5000 kB\nHugePages_Total: 0\n")
-    assert memory._host_available(tmp_path) == 5000 * 1024
+    assert memory.host_available(tmp_path) == 5000 * 1024
     limit = tmp_path / "sys/fs/cgroup" / path
     limit.parent.mkdir(parents=True)
     for text, expected in (("max", 5000 * 1024), ("4096", 4096), (str(2**60), 5000 * 1024)):
         limit.write_text(text + "\n")
-        assert memory._host_available(tmp_path) == expected
+        assert memory.host_available(tmp_path) == expected
 
 
 @pytest.mark.parametrize(

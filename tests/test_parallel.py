@@ -42,10 +42,11 @@ def computed():
 @pytest.mark.strict
 def test_environments_and_replay_are_the_same_to_the_bit_on_any_number_of_devices(computed):
     got = computed["environments_and_replay"]
-    for storage in ("pixels", "states"):
+    for storage in ("pixels", "states", "host"):
         assert set(got[f"equal, {storage}"]) == {True}
         assert set(got[f"placed, {storage}"]) == {True}
         assert got[f"share, {storage}"] == 8
+    assert got["frames, host"] == 2
     assert got["updates"] > 10
     assert got["evaluation"]
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import training
+from ne_dreamer_jax.host_frames import HostFrames
 from ne_dreamer_jax.loop import Counters, Evaluation, Loop, LoopState
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, ReturnScale, TrainState
 from tests.experiments import toy
@@ -23,6 +24,9 @@ def build(config, *, image: bool = True) -> training.Run:
     total = config.loop.env_steps // n
     prefill = config.loop.prefill // n
     observation = {"image": ArraySpec((16, 16, 3), jnp.uint8)} if image else {"position": ArraySpec((1,), jnp.float32)}
+
+    picture = ArraySpec((2, 2, 3), jnp.uint8)
+    frames = HostFrames(total, n, {"image": picture}) if config.loop.storage == "host" else None
 
     def init(key: Array) -> LoopState:
         start_key, key = jax.random.split(key)
@@ -39,7 +43,13 @@ def build(config, *, image: bool = True) -> training.Run:
         kernel = 0.9 * state.train.params["actor"]["kernel"] + jax.random.normal(noise_key, (3,))
         update = state.train.update + (done >= prefill).astype(jnp.int32)
         train = state.train._replace(params={"actor": {"kernel": kernel}}, update=update)
-        replay = state.replay.at[done].set(jax.random.bits(noise_key, (n,), jnp.uint8))
+        drawn = jax.random.bits(noise_key, (n,), jnp.uint8)
+        if frames is not None:  # replay is a sum of all that the host keeps
+            images = jax.random.bits(noise_key, (n, *picture.shape), jnp.uint8)
+            tickets = frames.put("image", frames.tickets(done), images)
+            back = frames.get("image", jnp.minimum(jnp.arange(total)[:, None], done) * n + (tickets % n)[None])
+            drawn = jnp.sum(back, axis=(0, 2, 3, 4), dtype=jnp.uint8)
+        replay = state.replay.at[done].set(drawn)
         return state._replace(train=train, replay=replay, counters=Counters(done + 1, done), key=key)
 
     @functools.partial(jax.jit, donate_argnums=0)
@@ -73,6 +83,7 @@ def build(config, *, image: bool = True) -> training.Run:
         vector_steps=total,
         prefill=prefill * n,
         updates=total - prefill,
+        frames=frames,
     )
     return training.Run(config, agent, loop, loop.shapes())  # type: ignore[arg-type]
 

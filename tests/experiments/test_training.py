@@ -50,7 +50,7 @@ def last_bits(path):
     """SHA-256 of every array of the last checkpoint."""
     newest = checkpoint.checkpoints(path / "checkpoints")[0]
     assert newest.step == LAST
-    assert set(newest.items) == {"agent", "loop"}
+    assert set(newest.items) >= {"agent", "loop"}
     return {(item, name): leaf["sha256"] for item, leaves in newest.items.items() for name, leaf in leaves.items()}
 
 
@@ -119,6 +119,18 @@ def test_stopping_and_going_on_changes_no_bit(finished, tmp_path, stops):
     assert any("Going on from" in line for line in lines)
     assert last_bits(tmp_path) == last_bits(finished[0])
     assert measured(tmp_path) == measured(finished[0])
+
+
+@pytest.mark.strict
+def test_images_on_the_host_are_saved_and_loaded_with_the_rest(tmp_path):
+    run = lambda: stub.build(toy.config(storage="host"))
+    code, _ = train(tmp_path / "stopped", terminate, "env step 48", run=run())
+    assert code == 128 + signal.SIGTERM
+    for path in (tmp_path / "stopped", tmp_path / "whole"):
+        assert train(path, run=run())[0] == 0
+    whole = last_bits(tmp_path / "whole")
+    assert ("frames", "image") in whole
+    assert last_bits(tmp_path / "stopped") == whole
 
 
 @pytest.mark.strict
