@@ -32,13 +32,14 @@ def main(envs: int, rows: int, side: int, batch_size: int, batch_length: int, ro
 
     shape = (side, side, 3)
     frames = HostFrames(rows, envs, {"image": ArraySpec(shape, jnp.uint8)})
+    frames.arrays["image"][...] = 1  # so that every page is there
     images = jax.random.bits(jax.random.key(0), (envs, *shape), jnp.uint8)
     first = jax.random.randint(jax.random.key(1), (2, batch_size, 1), 0, jnp.array([[[rows - batch_length]], [[envs]]]))
     row, env = (
         first[0] + jnp.arange(batch_length, dtype=jnp.int32)[None],
         jnp.broadcast_to(first[1], (batch_size, batch_length)),
     )
-    held = {"device": jnp.zeros((rows, envs, *shape), jnp.uint8)}
+    held = {"device": jnp.ones((rows, envs, *shape), jnp.uint8)}
 
     put = jax.jit(lambda ring, row: jax.lax.dynamic_update_index_in_dim(ring, images, row, 0), donate_argnums=0)
     get = jax.jit(lambda ring: ring.at[row, env].get(mode="promise_in_bounds"))
@@ -55,7 +56,12 @@ def main(envs: int, rows: int, side: int, batch_size: int, batch_length: int, ro
         "fetch, device": lambda: get(held["device"]),
         "fetch, host": lambda: host_get(row * envs + env),
     }
-    settings = {"images": envs, "batch": f"{batch_size} x {batch_length}", "side": side, "rows": rows}
+    settings: dict[str, str | int | float | None] = {
+        "images": envs,
+        "batch": f"{batch_size} x {batch_length}",
+        "side": side,
+        "rows": rows,
+    }
     report("storage", measure(cases, rounds=rounds, warmup=2), settings=settings)
 
 

@@ -182,7 +182,7 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
     like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=())}  # type: ignore[arg-type]
     if run.loop.frames is not None:
-        like["frames"] = run.loop.frames.shapes()
+        like["frames"] = run.loop.frames.shapes
     began = time.perf_counter()
     try:
         restored = checkpoint.restore(files.checkpoints, like)

@@ -1,12 +1,12 @@
 """Checkpoints: any pytree of arrays to disk and back, bit for bit, and noticed when it is not.
 
 A checkpoint holds one or more named items (training saves "agent", the train state, apart from "loop", everything
-else, so that an evaluation never reads the replay)::
+else, so that an evaluation never reads the replay; and "frames", images on the host, if there are any)::
 
     checkpoints/000000123456/        one checkpoint; the number is the step it was saved at
       manifest.json                  step, score, the caller's notes; of each item: the name, shape, dtype and SHA-256
                                      of every array, and the SHA-256 of every file; and a SHA-256 of all that
-      agent/  loop/                  the items, written by Orbax
+      agent/  loop/  frames/         the items, written by Orbax; numpy's arrays by numpy, which needs no copy
 
 Orbax loads an array with flipped bits, and casts one of another dtype, without a word. So an item's files are checked
 against the manifest before Orbax opens them, its arrays after, and what is to be read is compared with what is
@@ -85,12 +85,17 @@ def save(
     for item, tree in items.items():
         arrays = _flatten(tree)
         described[item] = {name: _describe(array) | _evidence(array) for name, array in arrays.items()}
-        stored = _stored(arrays)
+        stored, on_host = _stored(arrays)
         if stored:
             with _checkpointer() as checkpointer:
                 checkpointer.save((partial / item).absolute(), stored)
                 checkpointer.wait_until_finished()  # where an error of writing comes out
-        files[item] = _digest_files(partial / item)
+        for number, (name, array) in enumerate(on_host.items()):
+            (partial / item).mkdir(exist_ok=True)
+            described[item][name]["file"] = file = f"{number}.npy"
+            np.save(partial / item / file, array, allow_pickle=False)
+        written = sorted(path for path in (partial / item).rglob("*") if path.is_file())
+        files[item] = {path.relative_to(partial / item).as_posix(): _digest_file(path) for path in written}
     content = {
         "format": FORMAT,
         "step": step,
@@ -123,12 +128,12 @@ def restore(
     Args:
       like: item -> pytree of arrays or `jax.ShapeDtypeStruct` (from `jax.eval_shape`): the structure, shapes and
         dtypes to expect. Arrays go where a leaf's sharding says, else to this process's first device, as keys always
-        do. Only these items are read.
+        do; numpy's stay numpy's, and can be written to. Only these items are read.
       prefer: what to try first; after the best come the others, newest first.
 
     Raises:
       FileNotFoundError: no checkpoint holds these items.
-      DamagedError: there are some, and none is intact.
+      DamagedError: there are some, and none is intact. (What else Orbax may say of intact files comes out as it is.)
       ValueError: an intact one, but of another structure, shape or dtype, with what was expected and what was got.
     """
     found, skipped = _find(directory)
@@ -147,7 +152,9 @@ def restore(
             skipped.append(str(error))
             continue
         return Restored(checkpoint, items, skipped)
-    raise DamagedError(f"no checkpoint in {directory} is intact; remove it to begin anew. {' '.join(skipped)}")
+    raise DamagedError(
+        f"no checkpoint in {directory} is intact; to begin anew, choose another directory. {' '.join(skipped)}"
+    )
 
 
 def checkpoints(directory: Path) -> list[Checkpoint]:
@@ -266,13 +273,17 @@ def _data(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _stored(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """What goes to Orbax, which refuses arrays without elements; those are made anew.
+def _stored(arrays: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What goes to Orbax, and what is written by numpy.
 
-    In one process of several it takes numpy's alone, since a ``jax.Array`` would have to be known to all of them.
+    Orbax refuses arrays without elements; those are made anew. In one process of several it gets all, as numpy's, since
+    a ``jax.Array`` would have to be known to all of them.
     """
     data = {name: _data(array) for name, array in arrays.items() if math.prod(array.shape)}
-    return data if jax.process_count() == 1 else {name: np.asarray(array) for name, array in data.items()}
+    if jax.process_count() > 1:
+        return {name: np.asarray(array) for name, array in data.items()}, {}
+    on_host = {name: array for name, array in data.items() if isinstance(array, np.ndarray)}
+    return {name: array for name, array in data.items() if name not in on_host}, on_host
 
 
 def _describe(array: Any) -> dict[str, Any]:
@@ -288,37 +299,25 @@ def _digest(array: Any) -> str:
     return hashlib.sha256(data.reshape(-1).view(np.uint8)).hexdigest()
 
 
-def _digest_files(folder: Path) -> dict[str, str]:
-    """Path of each file in the folder -> its SHA-256; nothing where the folder is missing.
-
-    Raises:
-      OSError: a file can't be read.
-    """
-    digests = {}
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        with path.open("rb") as file:
-            digests[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
-    return digests
+def _digest_file(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _check_files(checkpoint: Checkpoint, item: str) -> None:
-    """Raises DamagedError where a file of the item is not as it was saved, is gone, or has been added.
+    """Raises DamagedError where a file of the item is gone or not as it was saved; others may lie beside them.
 
     It comes before Orbax, which reads several arrays at once: when one of them can't be read, it drops the others
     unfinished, and Python warns of those at any time later.
     """
     folder = checkpoint.path / item
-    try:
-        found = _digest_files(folder)
-    except OSError as error:
-        raise DamagedError(f"{folder} can't be read: {error}.") from error
-    saved = checkpoint.files[item]
-    different = [name for name in dict.fromkeys([*saved, *found]) if saved.get(name) != found.get(name)]
-    if different:
-        name = different[0]
-        fault = "is missing" if name not in found else "is not as it was saved" if name in saved else "was added"
-        more = f", and {len(different) - 1} more files like that" if len(different) > 1 else ""
-        raise DamagedError(f"{folder} is damaged: {name} {fault}{more}.")
+    for name, digest in checkpoint.files[item].items():
+        try:
+            intact = _digest_file(folder / name) == digest
+        except OSError as error:
+            raise DamagedError(f"{folder} is damaged: {name} can't be read: {error}.") from error
+        if not intact:
+            raise DamagedError(f"{folder} is damaged: {name} is not as it was saved.")
 
 
 def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
@@ -348,14 +347,20 @@ def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
         return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
 
     _check_files(checkpoint, item)
-    stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape)}
-    read: dict[str, jax.Array] = {}
+    described, folder = checkpoint.items[item], checkpoint.path / item
+    read: dict[str, Any] = {
+        # The view is for bfloat16, which numpy's files know as two bytes.
+        name: np.load(folder / leaf["file"], allow_pickle=False).view(jax.numpy.dtype(leaf["dtype"]))
+        for name, leaf in described.items()
+        if "file" in leaf
+    }
+    stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape) and name not in read}
     if stored:
         with _checkpointer() as checkpointer:
-            read = checkpointer.restore((checkpoint.path / item).absolute(), stored)
+            read |= checkpointer.restore(folder.absolute(), stored)
     leaves = []
     for name, leaf in expected.items():
-        saved = checkpoint.items[item][name]
+        saved = described[name]
         array = read[name] if name in read else jax.numpy.zeros(target(leaf).shape, target(leaf).dtype)
         if _digest(array) != saved["sha256"]:
             raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")

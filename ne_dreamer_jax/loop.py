@@ -1,8 +1,9 @@
 """Acting, the environments, replay and learning as one compiled program.
 
 ``Loop.chunk`` runs a number of vector steps on the device: step the environments, act, add to replay, and as many
-updates as the replay ratio asks for. The host sees one dict of metrics a chunk. The whole state is one pytree, so
-that going on from a saved one gives the same bits as never having stopped; where chunks begin and end changes none.
+updates as the replay ratio asks for. The host sees one dict of metrics a chunk. The whole state is one pytree (but for
+images that ``loop.storage=host`` keeps beside it, `Loop.frames`), so that going on from a saved one gives the same bits
+as never having stopped; where chunks begin and end changes none.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Episodes(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Everything that a run is: saved and restored as a whole."""
+    """Everything that a run is, `Loop.frames` apart: saved and restored as a whole."""
 
     train: TrainState
     env: Any  # environment states, [N, ...]
@@ -163,9 +164,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         )
     pictures = env.pictures if config.storage == "states" else None
     images = host_frames.images_of(agent.spec) if config.storage == "host" else {}
-    if config.storage == "host" and (not images or jax.process_count() > 1):
-        got = "several processes" if images else "an environment without images"
-        raise ValueError(f"loop.storage: expected 'pixels' or 'states' for {got}, got 'host'.")
+    if config.storage == "host":
+        _check_host(images)
     frames = HostFrames(capacity // n, n, images) if images else None
 
     def kept(env_state: Any, obs: Mapping[str, Array], row: Array) -> Mapping[str, Array]:
@@ -285,9 +285,6 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         train, replay, key, sums = carry
         key, sample_key = jax.random.split(key)
         batch = draw_batch(replay, sample_key)
-        if frames is not None:  # the images are read before a later step can be written over them
-            batch, position = jax.lax.optimization_barrier((batch, replay.position))
-            replay = replace(replay, position=position)
         train, latents, metrics = agent.train_step(train, batch)
         if config.write_latents:
             replay = replay_lib.write_latents(replay, batch.index, latents)
@@ -428,6 +425,21 @@ def over_seeds(
         return jax.vmap(loop.init, out_axes=axes)(keys)
 
     return init, jax.jit(jax.vmap(loop.chunk, in_axes=(axes, None), out_axes=(axes, 0)), donate_argnums=0)
+
+
+def _check_host(images: Mapping[str, Any]) -> None:
+    """Raises ValueError where images can't be kept on the host."""
+    if not images:
+        raise ValueError("loop.storage: expected 'pixels' for an environment without images, got 'host'.")
+    if jax.process_count() > 1:
+        raise ValueError("loop.storage: expected 'pixels' or 'states' for several processes, got 'host'.")
+    try:
+        jax.local_devices(backend="cpu")
+    except RuntimeError as error:
+        raise ValueError(
+            "loop.storage: 'host' needs JAX's cpu platform beside the accelerator's; expected both in JAX_PLATFORMS, "
+            f"such as 'cuda,cpu', got {jax.config.jax_platforms!r}."  # type: ignore[attr-defined]
+        ) from error
 
 
 def _nbytes(tree: Any) -> int:

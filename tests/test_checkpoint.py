@@ -126,7 +126,6 @@ DAMAGE = {
     "data cut in the middle": lambda path: truncate(data_file(path / "loop")),
     "data gone": lambda path: data_file(path / "loop").unlink(),
     "a small file gone": lambda path: min(files(path / "loop"), key=lambda file: file.stat().st_size).unlink(),
-    "a file too many": lambda path: (path / "loop" / "more").write_bytes(b"more"),
     "an item gone": lambda path: shutil.rmtree(path / "loop"),
     "a flipped bit in the manifest": lambda path: flip(path / "manifest.json"),
     "an edited manifest": lambda path: (path / "manifest.json").write_text(
@@ -150,6 +149,23 @@ def test_a_damaged_newest_is_passed_over(tmp_path, damage):
     assert str(newest.path) in restored.skipped[0]
     save(tmp_path, 2)  # the run comes to that step again
     assert checkpoint.restore(tmp_path, LIKE).checkpoint.step == 2
+
+
+def test_numpys_arrays_stay_numpys(tmp_path):
+    tree = {"a/b": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "half": np.full((3,), 2.5, jnp.bfloat16)}
+    saved = checkpoint.save(tmp_path, 1, {"frames": tree, "mixed": {"host": tree["a/b"], "device": jnp.ones(2)}})
+    like = {"frames": tree, "mixed": {"host": tree["a/b"], "device": jnp.zeros(2)}}
+    restored = checkpoint.restore(tmp_path, like).items
+    assert bits(restored["frames"]) == bits(tree)
+    assert isinstance(restored["mixed"]["device"], jax.Array)
+    for array in jax.tree.leaves(restored["frames"]):
+        assert isinstance(array, np.ndarray)
+        assert array.flags.writeable
+    (saved.path / "frames" / ".left-behind-by-a-file-system").write_bytes(b"more")
+    assert checkpoint.restore(tmp_path, like).skipped == []
+    flip(data_file(saved.path / "frames"))
+    with pytest.raises(checkpoint.DamagedError, match="not as it was saved"):
+        checkpoint.restore(tmp_path, like)
 
 
 def test_any_flipped_byte_is_noticed(tmp_path):

@@ -4,6 +4,7 @@ tests run the whole agent."""
 import dataclasses
 import operator
 from fractions import Fraction
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -279,11 +280,25 @@ def test_a_full_ring_on_the_host_keeps_the_newest_images():
     np.testing.assert_array_equal(kept, np.broadcast_to(time[..., None, None, None], kept.shape))
 
 
+def no_platform(local_devices, *args, backend=None, **kwargs):
+    if backend == "cpu":
+        raise RuntimeError("Unknown backend cpu")
+    return local_devices(*args, **kwargs)
+
+
 def test_images_on_the_host_are_refused_where_they_can_not_be(monkeypatch):
-    with pytest.raises(ValueError, match=r"loop.storage: expected 'pixels' or 'states' for an environment without"):
+    with pytest.raises(ValueError, match=r"loop.storage: expected 'pixels' for an environment without"):
         make(image=False, storage="host")
     with pytest.raises(ValueError, match=r"several seeds at once, got 'host'"):
         loops.over_seeds(make(image=True, storage="host"))
+    with monkeypatch.context() as patch:
+        patch.setattr(loops.jax, "process_count", lambda: 2)
+        with pytest.raises(ValueError, match=r"several processes, got 'host'"):
+            make(image=True, storage="host")
+    with monkeypatch.context() as patch:
+        patch.setattr(loops.jax, "local_devices", partial(no_platform, jax.local_devices))
+        with pytest.raises(ValueError, match="needs JAX's cpu platform"):
+            make(image=True, storage="host")
     loop = make(image=True, storage="host")
     images, rest = loop.frames.nbytes, loop.replay_bytes - loop.frames.nbytes
     working = counting.stub(counting.env().spec).working_bytes(None)

@@ -36,7 +36,7 @@ def compute(*parts):
 
 @pytest.fixture(scope="module")
 def computed():
-    return compute("environments_and_replay", "collectives", "moved")
+    return compute("environments_and_replay", "images_on_the_host", "collectives", "moved")
 
 
 @pytest.mark.strict
@@ -49,6 +49,10 @@ def test_environments_and_replay_are_the_same_to_the_bit_on_any_number_of_device
     assert got["frames, host"] == 2
     assert got["updates"] > 10
     assert got["evaluation"]
+
+
+def test_images_go_to_the_host_and_back_from_any_device(computed):
+    assert computed["images_on_the_host"] == 0
 
 
 def test_no_pixels_travel(computed):

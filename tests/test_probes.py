@@ -79,7 +79,13 @@ SEEDS = {"cue": 3}
 """Probe -> seeds of which one has to solve it, where that isn't the first: until cue, memory and use come together by
 chance there is nothing to learn from, and in 5,000 updates that happens with most seeds, not with all."""
 
-UNABLE = {("drqv2", "cue"): "it sees three frames and remembers nothing"}
+UNABLE = {
+    ("drqv2", "cue"): "it sees three frames and remembers nothing",
+    (
+        "dreamer_no_reconstruction",
+        "cue",
+    ): "nothing tells it that there is a cue until a reward depends on it, much later",
+}
 
 
 class Trainer:
