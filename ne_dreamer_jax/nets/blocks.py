@@ -6,6 +6,7 @@ are computed in float32.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -36,14 +37,33 @@ def rms_norm(x: Array, scale: Array) -> Array:
     return (x32 * inverse * jnp.expand_dims(scale, range(x.ndim - 1))).astype(x.dtype)
 
 
-def block_linear(x: Array, kernel: Array) -> Array:
-    """A linear map for each of G blocks: ``x [N, G, I]`` and ``kernel [G, I, O]`` to ``[N, G, O]``.
+def per_block(function: Callable[..., Array], activations: Sequence[Array], params: Sequence[Array]) -> Array:
+    """A function applied to each of G blocks with its own parameters, ``[N, G, O]``.
 
-    On a CPU block by block, which spares the two transpositions of XLA's batched product there.
+    Args:
+      function: of a block's share ``[N, ...]`` of each activation and of each parameter, to ``[N, O]``.
+      activations: ``[N, G, ...]`` each.
+      params: ``[G, ...]`` each.
+
+    On a CPU block by block: XLA's batched product transposes its operands there, and its loops over a slice of three
+    axes are not vectorised.
     """
     if on_cpu():
-        return jnp.stack([x[:, g] @ kernel[g] for g in range(kernel.shape[0])], axis=1)
-    return jnp.einsum("ngi,gio->ngo", x, kernel)
+        shares = [*(_unstack(x, 1) for x in activations), *(_unstack(x, 0) for x in params)]
+        return jnp.stack([function(*block) for block in zip(*shares, strict=True)], axis=1)
+    axes = (*(1 for _ in activations), *(0 for _ in params))
+    return jax.vmap(function, in_axes=axes, out_axes=1)(*activations, *params)
+
+
+def block_linear(x: Array, kernel: Array) -> Array:
+    """A linear map for each of G blocks: ``x [N, G, I]`` and ``kernel [G, I, O]`` to ``[N, G, O]``."""
+    return per_block(jnp.matmul, (x,), (kernel,))
+
+
+def _unstack(x: Array, axis: int) -> list[Array]:
+    """The slices along an axis. The gradient joins theirs, where that of indexing adds each to zeros."""
+    parts = jax.lax.split(x, (1,) * x.shape[axis], axis)
+    return [jax.lax.squeeze(part, (axis,)) for part in parts]
 
 
 class Linear(nn.Module):

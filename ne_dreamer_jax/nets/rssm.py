@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax.linen import initializers
 
 from ne_dreamer_jax.losses import unimix_logits
-from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init
+from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init, per_block
 from ne_dreamer_jax.types import Array, Latent
 
 
@@ -79,6 +79,15 @@ def sample_onehot(uniform: Array, logits: Array) -> Array:
     return sample + (probs - jax.lax.stop_gradient(probs))  # in this order the value is one-hot to the bit
 
 
+def _gate(x: Array, state: Array, kernel: Array, bias: Array) -> Array:
+    """A block's GRU gates: its new state [N, D / blocks] float32 from the candidate's input x and the old state."""
+    gates = (x @ kernel + bias[None]).astype(jnp.float32)
+    reset, candidate, update = jnp.split(gates, 3, axis=-1)
+    candidate = jnp.tanh(nn.sigmoid(reset) * candidate)
+    update = nn.sigmoid(update - 1)
+    return update * candidate + (1 - update) * state
+
+
 class RSSM(nn.Module):
     """Recurrence, prior and posterior. Its methods take any number of rows N."""
 
@@ -137,11 +146,9 @@ class RSSM(nn.Module):
         own = block_linear(state.astype(dtype), self.state_kernel.astype(dtype))
         x = own.reshape(-1, c.deter) + inputs @ self.input_kernel.astype(dtype) + self.hidden_bias.astype(dtype)[None]
         x = nn.silu(self.hidden_norm(x)).reshape(state.shape)
-        gates = block_linear(x, self.gate_kernel.astype(dtype)) + self.gate_bias.astype(dtype)[None]
-        reset, candidate, update = jnp.split(gates.astype(jnp.float32), 3, axis=-1)
-        candidate = jnp.tanh(nn.sigmoid(reset) * candidate)
-        update = nn.sigmoid(update - 1)
-        return (update * candidate + (1 - update) * state).reshape(-1, c.deter)
+        return per_block(
+            _gate, (x, state), (self.gate_kernel.astype(dtype), self.gate_bias.astype(dtype))
+        ).reshape(-1, c.deter)
 
     def prior(self, deter: Array) -> Array:
         """Logits of ``p(z_t | h_t)``: ``[..., D]`` to float32 ``[..., S, K]``, not yet mixed with the uniform."""
