@@ -6,6 +6,7 @@ the continuation of state t + 1 were received on arrival at it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -61,35 +62,69 @@ class BehaviorConfig:
 
 
 class Trajectory(NamedTuple):
-    """M imagined trajectories."""
+    """M imagined trajectories, and what was made of their states."""
 
-    feature: Array  # float32 [H + 1, M, F]
+    seen: Any  # [H, M, ...], what ``look`` returned at the states 0 .. H - 1
+    last: Any  # [M, ...], and at state H
     policy: Array  # float32 [H, M, outputs], the actor's outputs at all states but the last
     action: Array  # float32 [H, M, A], raw samples: not clipped
 
 
 def imagine(
-    nets: Networks, params: Params, key: Array, start: Latent, horizon: int, through_model: bool = False
+    nets: Networks,
+    params: Params,
+    key: Array,
+    start: Latent,
+    horizon: int,
+    look: Callable[[Array], Any] = lambda state: state,
+    through_model: bool = False,
 ) -> Trajectory:
     """H steps of the prior under the policy from ``start`` [M, ...]; the models see clipped actions.
+
+    ``look`` is applied to each state's feature [M, F] while it is at hand: what heads make of it is small, and all
+    features of all states are not.
 
     Gradients of ``policy`` reach the actor's parameters. Those of states and actions do so only where
     ``through_model``; otherwise actions are constants, and the actor need not be run again for its loss.
     """
 
-    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Array, Array, Array]]:
+    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Any, Array, Array]]:
         action_key, latent_key = jax.random.split(key)
         state = feature(latent)
-        outputs = nets.apply("actor", params, state)
+        outputs = keep_products(nets.apply)("actor", params, state)
         raw = policy(nets.heads, nets.spec.action, outputs).sample(action_key)
         raw = raw if through_model else jax.lax.stop_gradient(raw)
         uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
         action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
         after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
-        return after, (state, outputs, raw)
+        return after, (look(state), outputs, raw)
 
-    last, (states, outputs, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
-    return Trajectory(jnp.concatenate([states, feature(last)[None]]), outputs, actions)
+    last, (seen, outputs, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
+    return Trajectory(seen, look(feature(last)), outputs, actions)
+
+
+def keep_products(apply: Callable[..., Any]) -> Callable[..., Any]:
+    """`Networks.apply` inside a scan, of which matrix products alone are kept for the gradient.
+
+    What lies between them is computed again: less work than to write it for every step and to read it back.
+    """
+
+    def call(name: str, params: Params, x: Array) -> Array:
+        head = lambda params, x: apply(name, {name: params}, x)
+        return jax.checkpoint(head, policy=jax.checkpoint_policies.dots_saveable, prevent_cse=False)(params[name], x)
+
+    return call
+
+
+class Judgement(NamedTuple):
+    """What the heads say of states [...]."""
+
+    reward: Array  # float32 [...], received on arrival
+    discount: Array  # float32 [...], the probability of going on; it contains the discount
+    value: Array  # float32 [...]
+    logits: Array  # float32 [..., bins], the critic's
+    slow_value: Array  # float32 [...]
+    policy: Array | None  # float32 [..., outputs], the actor's with the state held fixed, where gradients pass states
 
 
 def actor_critic_losses(
@@ -108,21 +143,35 @@ def actor_critic_losses(
     """
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
+    bins = symexp_bins(nets.heads.bins)
+    slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)
+
+    def judge(state: Array) -> Judgement:
+        fixed = jax.lax.stop_gradient(state)
+        logits = keep_products(nets.apply)("critic", params, fixed)
+        seen = state if through_model else fixed
+        return Judgement(
+            reward=twohot_mean(nets.apply("reward", frozen, seen), bins),
+            # The head's probability already contains the discount (see world_model.prediction_losses).
+            discount=jax.nn.sigmoid(nets.apply("continue", frozen, seen)[..., 0]),
+            value=twohot_mean(
+                nets.apply("critic", frozen, seen) if through_model else jax.lax.stop_gradient(logits), bins
+            ),
+            logits=logits,
+            slow_value=slow_value(fixed),
+            policy=keep_products(nets.apply)("actor", params, fixed) if through_model else None,
+        )
+
     acting = {**frozen, "actor": params["actor"]}
     start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
-    imagined = imagine(nets, acting, key, start, config.horizon, through_model)
-    states = jax.lax.stop_gradient(imagined.feature)
-
-    bins = symexp_bins(nets.heads.bins)
-    steps_last = lambda x: jnp.swapaxes(x, 0, 1)  # [H + 1, M] -> [M, H + 1]
-    evaluated = imagined.feature if through_model else states
-    reward = steps_last(twohot_mean(nets.apply("reward", frozen, evaluated), bins))
-    # The head's probability already contains the discount (see world_model.prediction_losses).
-    discount = steps_last(jax.nn.sigmoid(nets.apply("continue", frozen, evaluated)[..., 0]))
-    logits = nets.apply("critic", params, states)
-    value = steps_last(twohot_mean(nets.apply("critic", frozen, evaluated) if through_model else logits, bins))
-    if not through_model:
-        value = jax.lax.stop_gradient(value)
+    imagined = imagine(nets, acting, key, start, config.horizon, judge, through_model)
+    seen, last = imagined.seen, imagined.last
+    of_all = lambda before, last: jnp.concatenate([before, last[None]]).T  # [M, H + 1]
+    reward, discount, value = (
+        of_all(seen.reward, last.reward),
+        of_all(seen.discount, last.discount),
+        of_all(seen.value, last.value),
+    )
     returns = lambda_returns(reward, value, discount, config.lam)  # [M, H]
     weight = jax.lax.stop_gradient(jnp.cumprod(discount, axis=1))[:, :-1]
 
@@ -131,20 +180,17 @@ def actor_critic_losses(
     )
     divisor = return_scale(scale.low, scale.high, config.return_floor)
     # The entropy's gradient goes to the actor at its own state, never through the states before.
-    outputs = nets.apply("actor", params, states[:-1]) if through_model else imagined.policy
+    outputs = imagined.policy if seen.policy is None else seen.policy
     distribution = policy(nets.heads, nets.spec.action, outputs)
-    entropy = steps_last(distribution.entropy())
+    entropy = distribution.entropy().T
     if through_model:
         actor = dynamics_loss(returns / divisor, entropy, weight, config.entropy)
     else:
         advantage = (returns - value[:, :-1]) / divisor
-        log_prob = steps_last(distribution.log_prob(imagined.action))
+        log_prob = distribution.log_prob(imagined.action).T
         actor = reinforce_loss(log_prob, advantage, entropy, weight, config.entropy)
 
-    slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)
-    logits = jnp.swapaxes(logits, 0, 1)[:, :-1]
-    critic = critic_loss(logits, returns, steps_last(slow_value(states[:-1])), weight, bins, config.slow_scale)
-
+    critic = critic_loss(seen.logits, returns.T, seen.slow_value, weight.T, bins, config.slow_scale)  # [H, M]
     replay_critic = _replay_critic_loss(nets, config, params, slow_value, rollout, returns[:, 0])
     losses = {"actor": jnp.mean(actor), "critic": jnp.mean(critic), "replay_critic": jnp.mean(replay_critic)}
     metrics = {

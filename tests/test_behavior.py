@@ -39,9 +39,10 @@ def make(spec, config):
 
 
 def frozen_trajectory(nets, params, rollout, key):
-    """What is imagined from every replayed state, and the latents' other view: the states' deterministic part."""
+    """Every replayed state, what is imagined from it, and all features [H + 1, M, F]."""
     start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
-    return start, behavior.imagine(nets, params, key, start, H)
+    imagined = behavior.imagine(nets, params, key, start, H)
+    return start, imagined, jnp.concatenate([imagined.seen, imagined.last[None]])
 
 
 @pytest.fixture(scope="module")
@@ -53,32 +54,30 @@ def reinforce():
     @jax.jit
     def run(params, slow, batch):
         gradients, (out, rollout) = jax.jacrev(lambda p: model.compute(p, slow, batch, KEY), has_aux=True)(params)
-        start, trajectory = frozen_trajectory(nets, params, rollout, KEY)
-        heads = {
-            name: nets.apply(name, params, trajectory.feature) for name in ("actor", "critic", "reward", "continue")
-        }
-        heads["slow"] = nets.apply("critic", {"critic": slow}, trajectory.feature)
+        start, trajectory, features = frozen_trajectory(nets, params, rollout, KEY)
+        heads = {name: nets.apply(name, params, features) for name in ("actor", "critic", "reward", "continue")}
+        heads["slow"] = nets.apply("critic", {"critic": slow}, features)
         replayed = {"critic": nets.apply("critic", params, rollout.feature)}
         replayed["slow"] = nets.apply("critic", {"critic": slow}, rollout.feature)
         rssm = lambda latent, action: nets.rssm.apply(
             {"params": params["rssm"]}, latent, action, method=lambda m, x, a: m.recur(x, m.embed_action(a))
         )
         follows = rssm(start, jnp.clip(trajectory.action[0], -1, 1))
-        return gradients, out, rollout, start, trajectory, heads, replayed, follows
+        return gradients, out, rollout, start, trajectory, features, heads, replayed, follows
 
-    names = ("gradients", "out", "rollout", "start", "trajectory", "heads", "replayed", "follows")
+    names = ("gradients", "out", "rollout", "start", "trajectory", "features", "heads", "replayed", "follows")
     return SimpleNamespace(**dict(zip(names, run(model.params, model.slow, model.batch), strict=True)), **vars(model))
 
 
 def test_imagination_starts_at_the_replayed_states_and_follows_clipped_actions(reinforce):
-    trajectory, nets = reinforce.trajectory, reinforce.nets
-    assert trajectory.feature.shape == (H + 1, B * T, nets.feature)
+    trajectory, features, nets = reinforce.trajectory, reinforce.features, reinforce.nets
+    assert features.shape == (H + 1, B * T, nets.feature)
     assert trajectory.action.shape == (H, B * T, 2)
     start = np.asarray(reinforce.rollout.feature).reshape(B * T, -1)
-    np.testing.assert_array_equal(trajectory.feature[0], start)
+    np.testing.assert_array_equal(features[0], start)
     assert np.abs(trajectory.action).max() > 1  # raw
-    np.testing.assert_allclose(trajectory.feature[1][:, 16:], reinforce.follows, atol=1e-5)
-    stoch = np.asarray(trajectory.feature[..., :16]).reshape(H + 1, B * T, 4, 4)
+    np.testing.assert_allclose(features[1][:, 16:], reinforce.follows, atol=1e-5)
+    stoch = np.asarray(features[..., :16]).reshape(H + 1, B * T, 4, 4)
     np.testing.assert_array_equal(stoch.sum(-1), 1)
 
 
@@ -178,23 +177,23 @@ def test_the_score_functions_gradient_is_that_of_one_batched_actor_on_frozen_tra
             return losses["actor"], rollout
 
         gradient, rollout = jax.grad(actor_loss, has_aux=True)(params)
-        _, trajectory = frozen_trajectory(nets, params, rollout, KEY)
+        _, trajectory, features = frozen_trajectory(nets, params, rollout, KEY)
         time_last = lambda x: jnp.swapaxes(x, 0, 1)
         bins = symexp_bins(15)
-        mean = lambda head: time_last(twohot_mean(nets.apply(head, params, trajectory.feature), bins))
-        go_on = time_last(jax.nn.sigmoid(nets.apply("continue", params, trajectory.feature)[..., 0]))
+        mean = lambda head: time_last(twohot_mean(nets.apply(head, params, features), bins))
+        go_on = time_last(jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0]))
         returns = lambda_returns(mean("reward"), mean("critic"), go_on, CONFIG.lam)
         low, high = update_percentiles(*OLD_SCALE, returns, CONFIG.return_decay, CONFIG.return_percentiles)
         advantage = (returns - mean("critic")[:, :-1]) / return_scale(low, high)
         weight = jnp.cumprod(go_on, axis=1)[:, :-1]
 
         def loss(actor):
-            outputs = nets.apply("actor", {"actor": actor}, trajectory.feature[:-1])
+            outputs = nets.apply("actor", {"actor": actor}, features[:-1])
             distribution = policy(nets.heads, spec.action, outputs)
             log_prob = time_last(distribution.log_prob(trajectory.action))
             return jnp.mean(-weight * (advantage * log_prob + CONFIG.entropy * time_last(distribution.entropy())))
 
-        outputs = nets.apply("actor", params, trajectory.feature[:-1])
+        outputs = nets.apply("actor", params, features[:-1])
         return gradient["actor"], jax.grad(loss)(params["actor"]), trajectory.policy, outputs
 
     got, want, outputs, expected = run(model.params)
