@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names
 
 PARTS = ("environment", "rendering", "acting", "replay", "learning")
@@ -131,4 +132,5 @@ def _parts(config: Any) -> dict[str, Callable[[], Any]]:
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

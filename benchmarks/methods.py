@@ -9,6 +9,7 @@ import click
 
 from benchmarks import common
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import names
 
 METHODS = tuple(name for name in names.METHODS if "/" not in name)
@@ -89,4 +90,5 @@ def _update(agent: Any) -> tuple[Callable[[], Any], int]:
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import names
 
 
@@ -72,4 +73,5 @@ def main(
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from benchmarks import common
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import names
 
 
@@ -129,4 +130,5 @@ def _bind(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[[], A
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

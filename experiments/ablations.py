@@ -1,6 +1,7 @@
 """The paper's ablations on one task: ``python -m experiments.ablations --help``."""
 
 from experiments.compare import command
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import names
 
 main = command(
@@ -13,4 +14,5 @@ main = command(
 )
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

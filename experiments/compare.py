@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names, run_directory
 
 if TYPE_CHECKING:
@@ -188,4 +189,5 @@ main = command(
 )
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

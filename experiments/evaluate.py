@@ -12,6 +12,7 @@ from typing import Any, Literal
 import click
 
 from experiments.options import quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import run_directory
 
 
@@ -122,4 +123,5 @@ EVALUATION = 0x65_76_61_6C  # sets these episodes apart from those of a run with
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()

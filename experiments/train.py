@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from experiments.options import Name, quiet, refusing
+from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names, run_directory, settings
 
 if TYPE_CHECKING:
@@ -189,4 +190,5 @@ def configure(
 
 
 if __name__ == "__main__":
+    use_large_pages()
     main()
