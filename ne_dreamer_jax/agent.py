@@ -212,10 +212,10 @@ def parameter_counts(params: Params) -> dict[str, int]:
 
 
 def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
-    """Gradients and what becomes of them; about ten arrays of all imagined features; the encoder's, by frames."""
+    """The gradients; as much as seven or eight arrays of all imagined features; the encoder's, by frames."""
     steps = config.batch_size * config.batch_length
     imagined = 4 * feature * steps * (config.behavior.horizon + 1)
-    return 3 * 4 * sum(parameter_counts(params).values()) + 10 * imagined + 200_000 * steps
+    return 4 * sum(parameter_counts(params).values()) + 15 * imagined // 2 + 140_000 * steps
 
 
 def _compute_dtype(name: str) -> Any:
