@@ -155,8 +155,8 @@ _COMMAND = (sys.executable, "-m", "benchmarks.mujoco_pictures")
 
 def _store(path: pathlib.Path, drawn: Any, reference: Any) -> None:
     """Three states, each ours, MuJoCo's, and their difference four times enlarged, side by side."""
-    import imageio.v3 as imageio
     import numpy as np
+    from matplotlib import image
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -164,7 +164,7 @@ def _store(path: pathlib.Path, drawn: Any, reference: Any) -> None:
         difference = np.abs(drawn[i].astype(int) - reference[i])
         rows.append(np.concatenate([drawn[i], reference[i], np.minimum(4 * difference, 255).astype(np.uint8)], 1))
     picture = np.concatenate(rows).repeat(3, 0).repeat(3, 1)
-    imageio.imwrite(path, picture)
+    image.imsave(path, picture)
 
 
 if __name__ == "__main__":

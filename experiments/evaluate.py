@@ -13,7 +13,7 @@ import click
 
 from experiments.options import quiet, refusing
 from experiments.pages import use_large_pages
-from ne_dreamer_jax import run_directory
+from ne_dreamer_jax import run_directory, settings
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -57,7 +57,8 @@ def main(
         )
     quiet()
     if backend == "dm_control":
-        allow_opengl()
+        with refusing(ValueError):
+            allow_opengl()
     import jax
     import numpy as np
 
@@ -101,7 +102,7 @@ def main(
                 "returns": [float(value) for value in returns],
                 "lengths": [int(value) for value in evaluation.lengths],
             }
-            where = "" if place == "mjx" else f" in {place}"
+            where = {"mjx": " here" if len(evaluate) > 1 else ""}.get(place, f" in {place}")
             click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
             if place == "mjx" and name == "policy" and with_video:
                 if evaluation.frames is None:
@@ -113,9 +114,20 @@ def main(
     run_directory.write_evaluation(files, content)
 
 
+_NO_OPENGL = ("", "disable", "disabled", "off", "0", "false", "no")
+_OPENGL = ("egl", "osmesa", "glfw", "glx", "cgl", "wgl", "enable", "enabled", "on", "true", "1")
+
+
 def allow_opengl() -> None:
-    """Sets ``MUJOCO_GL`` to draw without a screen, unless it already names a way to draw; call before MuJoCo loads."""
-    if os.environ.get("MUJOCO_GL", "disable").lower() in ("", "disable", "disabled", "off", "0", "false", "no"):
+    """Sets ``MUJOCO_GL`` to draw without a screen, unless it already names a way to draw; call before MuJoCo loads.
+
+    Raises:
+      ValueError: it names none that MuJoCo knows.
+    """
+    given = os.environ.get("MUJOCO_GL", "")
+    if given.lower() not in (*_NO_OPENGL, *_OPENGL):
+        raise ValueError(f"MUJOCO_GL: no way to draw is called {given!r}. {settings.did_you_mean(given, _OPENGL)}")
+    if os.environ.get("MUJOCO_GL", "disable").lower() in _NO_OPENGL:
         os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
 
 

@@ -211,7 +211,8 @@ def _same_for_all(files: RunDirectory, env_step: int) -> None:
 
 
 def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
-    echo("Compiling the training chunk: act, step and draw the environments, store, sample, update.")
+    draws = "and draw " if "image" in run.agent.spec.observation else ""
+    echo(f"Compiling the training chunk: act, step {draws}the environments, store, sample, update.")
     jitted: Any = run.loop.chunk
     began = time.perf_counter()
     lowered = jitted.lower(state, jnp.zeros((), jnp.int32))

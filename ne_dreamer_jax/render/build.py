@@ -30,21 +30,23 @@ _KINDS = {
 }
 _SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
 _SIZES_USED = {_SPHERE: (1, 0, 0), _CAPSULE: (1, 1, 0)}  # of three, where not all
+_NEAR, _FAR = 0.01, 20.0  # in extents of the model: MuJoCo's default, and the least in the Control Suite
 _STRING_SEGMENTS = 8  # MuJoCo takes 28
 _FIXED, _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _SPOT, _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_SPOT), int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
-def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 64) -> Scene:
+def build(model: mujoco.MjModel, camera_id: int | str, height: int = 64, width: int = 64) -> Scene:
     """The constants of ``model`` seen through one of its cameras, for pictures of ``height`` by ``width`` pixels.
+
+    Args:
+      camera_id: the camera's id, or its name.
 
     Raises:
       ValueError: the model uses something that is not drawn (the message names it), or there is no such camera.
     """
-    if not 0 <= camera_id < model.ncam:
-        names = [model.camera(i).name for i in range(model.ncam)]
-        raise ValueError(f"expected a camera id from 0 to {model.ncam - 1}, got {camera_id}; the model has {names}")
+    camera_id = _camera_id(model, camera_id)
     floor_id = _floor_id(model)
     _refuse_unsupported(model, camera_id, floor_id)
     axes = model.cam_mat0[camera_id].reshape(3, 3)
@@ -95,6 +97,19 @@ def build(model: mujoco.MjModel, camera_id: int, height: int = 64, width: int = 
     with jax.ensure_compile_time_eval():
         view = floor.view(scene, camera.camera_position(scene, data), camera.place_lights(scene, data))
     return dataclasses.replace(scene, floor_view=jax.tree.map(np.asarray, view))
+
+
+def _camera_id(model: mujoco.MjModel, camera: int | str) -> int:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if not names:
+        raise ValueError("expected a model with a camera, to be drawn through; got one without")
+    if isinstance(camera, str) and camera in names:
+        return names.index(camera)
+    if isinstance(camera, str) or not 0 <= camera < model.ncam:
+        raise ValueError(
+            f"expected the name of a camera or an id from 0 to {model.ncam - 1}, got {camera!r}; the model has {names}"
+        )
+    return camera
 
 
 def _floats(vector: np.ndarray) -> Vec:
@@ -270,6 +285,13 @@ def _refuse_unsupported(model: mujoco.MjModel, camera_id: int, floor_id: int | N
         refuse(seen, "it is orthographic")
     if model.cam_sensorsize[camera_id].any():
         refuse(seen, "its view is set by sensor size and focal length; use fovy")
+    near, far = model.vis.map.znear, model.vis.map.zfar
+    if near > _NEAR or far < _FAR:
+        refuse(
+            "this view",
+            f"MuJoCo cuts off what is nearer or farther than visual/map says, which is not done here; expected znear "
+            f"of at most {_NEAR:g} and zfar of at least {_FAR:g}, got {near:g} and {far:g}",
+        )
     if model.nskin:
         refuse("a skin", "skins are not supported")
     if model.nflex:

@@ -160,7 +160,11 @@ def test_a_task_of_ones_own_makes_a_conforming_environment():
     ("edit", "message"),
     [
         (('<option timestep="0.01"', '<option timestep="0.01" noslip_iterations="3"'), "uses noslip iterations"),
-        (('integrator="Euler"', 'integrator="implicit"'), "IMPLICIT"),
+        (
+            ('integrator="Euler"', 'integrator="implicit"'),
+            "expected its integrator to be Euler or RK4 or implicitfast, got IMPLICIT",
+        ),
+        (('<option timestep="0.01"', '<option timestep="0.01" solver="PGS"'), "expected its solver to be CG or Newton"),
         (
             ('type="capsule"', 'type="capsule" fluidshape="ellipsoid"'),
             None,  # without a fluid it has no effect
@@ -200,6 +204,62 @@ def test_a_control_timestep_that_is_no_multiple_is_refused():
 def test_an_actuator_without_a_range_is_refused_by_its_name():
     with pytest.raises(ValueError, match=r"a ctrlrange for each actuator.*got none for \['motor'\]"):
         dmc.from_task(own_task(swinging(limited=False)), obs="vector")
+
+
+def test_what_is_no_model_is_refused():
+    with pytest.raises(ValueError, match=r"expected a mujoco.MjModel, such as .* got '/a/path.xml'"):
+        dmc.Simulation.of("/a/path.xml")
+
+
+SHAPES = {
+    "no reward": ({"reward": lambda data, _: data.qpos[:1]}, r"task.reward: expected a single number"),
+    "no dict": ({"observe": lambda data, _: data.qpos}, r"task.observe: expected a dict of names and arrays"),
+    "a matrix": (
+        {"observe": lambda data, _: {"x": data.xmat}},
+        r"expected 'x' to have at most one axis, got \[3, 3, 3\]",
+    ),
+    "a second image": (
+        {"observe": lambda data, _: {"image": data.qpos}},
+        r"another name than 'image', which the pixels",
+    ),
+    "no camera of this name": ({"camera": "sde"}, r"the name of a camera or an id from 0 to 0, got 'sde'.*\['side'\]"),
+    "no camera of this number": ({"camera": 1}, r"an id from 0 to 0, got 1"),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_a_tasks_parts_have_the_shapes_that_it_says(kind):
+    changes, message = SHAPES[kind]
+    with pytest.raises(ValueError, match=message):
+        dmc.from_task(own_task(swinging())._replace(**changes), obs="both", image_size=16)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"), [("actuator", "a model with an actuator"), ("camera", "a model with a camera, to be drawn")]
+)
+def test_what_a_model_lacks_is_named(part, message):
+    text = FALLING.format(sensors="").replace("<worldbody>", '<worldbody><camera pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>')
+    whole = text[: text.index("<actuator>")] + "</mujoco>" if part == "actuator" else FALLING.format(sensors="")
+    with pytest.raises(ValueError, match=message):
+        dmc.from_task(own_task(mujoco.MjModel.from_xml_string(whole)), image_size=16)
+
+
+def test_a_camera_has_a_name():
+    from ne_dreamer_jax import render
+
+    model = swinging()
+    assert render.build(model, "side", 16, 16).camera == render.build(model, 0, 16, 16).camera == 0
+
+
+@pytest.mark.parametrize("view", ['znear="0.5"', 'zfar="3"'])
+def test_a_view_that_is_cut_off_is_refused(view):
+    from ne_dreamer_jax import render
+
+    text = SWINGING.format(
+        integrator="Euler", joint="hinge", dynamics="none", sensors="", alpha=1, ctrlrange='ctrlrange="-1 1"'
+    ).replace("<worldbody>", f"<visual><map {view}/></visual><worldbody>")
+    with pytest.raises(ValueError, match=r"this view can't be drawn: .* expected znear of at most 0.01 and zfar of at"):
+        render.build(mujoco.MjModel.from_xml_string(text), 0, 16, 16)
 
 
 def test_what_cannot_be_drawn_is_named_and_does_not_matter_without_pixels():

@@ -71,6 +71,12 @@ def test_opengl_is_asked_for_by_name_and_a_users_choice_stands(monkeypatch):
         assert evaluate.os.environ["MUJOCO_GL"] in wanted
 
 
+def test_a_mistyped_way_to_draw_is_refused(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmessa")
+    with pytest.raises(ValueError, match=r"no way to draw is called 'osmessa'. Did you mean osmesa"):
+        evaluate.allow_opengl()
+
+
 def test_without_opengl_the_message_says_what_to_install(monkeypatch):
     def refuse(player, size):
         raise OSError("no such library")

@@ -253,7 +253,7 @@ def test_shapes_without_an_intersection_are_refused(asset, geom):
 
 
 def test_a_camera_that_does_not_exist_is_refused_with_those_that_do():
-    with pytest.raises(ValueError, match=r"camera id from 0 to 0, got 3; the model has \['front'\]"):
+    with pytest.raises(ValueError, match=r"an id from 0 to 0, got 3; the model has \['front'\]"):
         render.build(compile_model(), 3)
 
 

@@ -39,6 +39,8 @@ def from_task(
 ) -> base.Env:
     """Makes an environment of a task, one's own included. Its ``env_state.physics`` is the ``mjx.Data``.
 
+    ``env_state.core`` is a `State`: ``core.physics`` again, and ``core.episode``, what the episode has drawn.
+
     Args:
       task: its ``simulation`` is ``Simulation.load("fish.xml")`` for a model of the Control Suite, or
         ``Simulation.of(mj_model)`` for any other.
@@ -49,8 +51,9 @@ def from_task(
       fast: solve constraints with a shorter line search than MuJoCo's, `Simulation.fast`.
 
     Raises:
-      ValueError: an option has a bad value, an actuator has no range, or the picture needs what the renderer does
-        not draw (the message names it).
+      ValueError: an option has a bad value, an actuator has no range or there is none, the task's reward or
+        observations have other shapes than `Task` says, or the picture needs what the renderer does not draw (the
+        message names it).
     """
     _check(obs=obs, action_repeat=action_repeat, image_size=image_size, fast=fast)
     if fast:

@@ -17,17 +17,30 @@ Episode = Any  # what a task draws anew for each episode besides the state, a py
 
 
 class Task(NamedTuple):
-    """A task as its domain's file defines it."""
+    """A task: a model, and functions of its ``mjx.Data`` and of what the episode has drawn.
+
+    Attributes:
+      simulation: the model and its stepping.
+      time_limit: seconds of an episode.
+      reset: key -> the first state and the episode's draws; from ``simulation.initial()``, with another ``qpos`` and
+        ``qvel``. Nothing that depends on these needs to be current.
+      reward: (data, episode) -> float32 [], of each control step.
+      observe: (data, episode) -> name -> float32 [] or [n], the observations beside pixels.
+      episode: an example of what ``reset`` draws besides the state, for shapes.
+      coast: control steps without action from the first state on, before the episode begins.
+      camera: id or name of the camera whose pixels agents see.
+      pose: (data, episode) -> data with what the episode moves, such as a target, for drawing.
+    """
 
     simulation: Simulation
-    time_limit: float  # seconds
-    reset: Callable[[Array], tuple[mjx.Data, Episode]]  # key -> the first state, not settled
-    reward: Callable[[mjx.Data, Episode], Array]  # float32 []
-    observe: Callable[[mjx.Data, Episode], dict[str, Array]]  # dm_control's observations, float32
-    episode: Episode = ()  # an example, for shapes
-    coast: int = 0  # control steps without action from the first state on, before the episode begins
-    camera: int = 0  # the camera whose pixels agents see
-    pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data  # with what the episode moves, for drawing
+    time_limit: float
+    reset: Callable[[Array], tuple[mjx.Data, Episode]]
+    reward: Callable[[mjx.Data, Episode], Array]
+    observe: Callable[[mjx.Data, Episode], dict[str, Array]]
+    episode: Episode = ()
+    coast: int = 0
+    camera: int | str = 0
+    pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data
 
 
 def random_joints(mj_model: mujoco.MjModel, unlimited: bool = True) -> Callable[[Array], Array]:

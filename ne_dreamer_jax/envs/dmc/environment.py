@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -28,11 +28,16 @@ class State(NamedTuple):
 def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base.Core:
     """The task as a ``Core``; arguments and errors as in ``dmc.from_task``."""
     simulation = task.simulation
+    if not simulation.mj_model.nu:
+        raise ValueError("expected a model with an actuator, which actions drive; got one without")
     unlimited = simulation.mj_model.actuator_ctrlrange[:, 0] >= simulation.mj_model.actuator_ctrlrange[:, 1]
     if unlimited.any():
         names = [simulation.mj_model.actuator(i).name or f"number {i}" for i in unlimited.nonzero()[0]]
         raise ValueError(f"expected a ctrlrange for each actuator, which actions are scaled to; got none for {names}")
     initial = simulation.initial()
+    reward: Any = jax.eval_shape(task.reward, initial, task.episode)
+    if getattr(reward, "shape", None) != ():
+        raise ValueError(f"task.reward: expected a single number, float32 [], got {reward}")
     time_limit = math.ceil(round(task.time_limit / simulation.control_timestep, 6))  # in control steps
     low, high = simulation.mj_model.actuator_ctrlrange.astype("float32").T
     true, false = jnp.ones((), bool), jnp.zeros((), bool)
@@ -96,6 +101,7 @@ def _make_observe(
         )
     if obs != "pixels":
         vectors: Any = jax.eval_shape(task.observe, task.simulation.initial(), task.episode)
+        _check_vectors(vectors, taken=spec)
         spec |= {name: ArraySpec(value.shape, jnp.float32) for name, value in vectors.items()}
 
     def observe(state: State) -> dict[str, Array]:
@@ -108,3 +114,16 @@ def _make_observe(
         return observation
 
     return spec, observe, pictures
+
+
+def _check_vectors(vectors: Any, taken: Mapping[str, Any]) -> None:
+    """Raises ValueError where these are no observations of a task beside those whose names are taken."""
+    if not isinstance(vectors, Mapping):
+        raise ValueError(f"task.observe: expected a dict of names and arrays, got {type(vectors).__name__}")
+    for name, value in vectors.items():
+        if name in taken:
+            raise ValueError(f"task.observe: expected another name than {name!r}, which the pixels have")
+        if len(value.shape) > 1:
+            raise ValueError(
+                f"task.observe: expected {name!r} to have at most one axis, got {list(value.shape)}; flatten it"
+            )

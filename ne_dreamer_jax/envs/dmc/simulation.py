@@ -150,9 +150,13 @@ class Simulation:
           control_timestep: seconds, a multiple of the model's timestep; None: one physics step.
 
         Raises:
-          ValueError: MJX can't simulate the model as MuJoCo does (the message says what it can't), or the control
-            timestep is no multiple.
+          ValueError: this is no model, MJX can't simulate it as MuJoCo does (the message says what it can't), or the
+            control timestep is no multiple.
         """
+        if not isinstance(mj_model, mujoco.MjModel):
+            raise ValueError(
+                f"expected a mujoco.MjModel, such as mujoco.MjModel.from_xml_path makes of a file, got {mj_model!r}"
+            )
         mj_model = copy.copy(mj_model)
         timestep = mj_model.opt.timestep
         n_sub_steps = 1 if control_timestep is None else round(control_timestep / timestep)
@@ -282,6 +286,15 @@ def _refuse_what_mjx_leaves_out(mj_model: mujoco.MjModel) -> None:
         "the ellipsoid model of fluids (geom fluidshape)": in_fluid and bool((mj_model.geom_fluid[:, 0] > 0).any()),
         "plugins": mj_model.nplugin > 0,
     }
+    for option, kind, known in (
+        ("integrator", mujoco.mjtIntegrator, ("Euler", "RK4", "implicitfast")),
+        ("solver", mujoco.mjtSolver, ("CG", "Newton")),
+    ):
+        name = kind(getattr(mj_model.opt, option)).name.split("_", 1)[1]  # of mjSOL_PGS and the like
+        if name.lower() not in [other.lower() for other in known]:
+            raise ValueError(
+                f"MJX can't simulate this model: expected its {option} to be {' or '.join(known)}, got {name}"
+            )
     for what, used in missing.items():
         if used:
             raise ValueError(f"MJX can't simulate this model: it uses {what}, which MJX lacks")
