@@ -132,5 +132,5 @@ def _parts(config: Any) -> dict[str, Callable[[], Any]]:
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("benchmarks.loop")
     main()

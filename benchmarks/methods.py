@@ -90,5 +90,5 @@ def _update(agent: Any) -> tuple[Callable[[], Any], int]:
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("benchmarks.methods")
     main()

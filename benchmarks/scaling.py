@@ -73,5 +73,5 @@ def main(
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("benchmarks.scaling")
     main()

@@ -112,13 +112,17 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
         losses, _, _ = behavior.actor_critic_losses(nets, config.behavior, p, slow, scale, key, rollout)
         return sum(losses.values(), jnp.zeros(()))
 
+    def imagined(p: Any, start: Any) -> Any:
+        # As in the update, little is kept of the states.
+        return behavior.imagine(nets, p, key, start, config.behavior.horizon, lambda state: state[:, 0])
+
     start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
     compiled = {
         "encoder": (jax.grad(encoder), (params,)),
         "observe": (jax.grad(posterior_scan, (0, 1)), (params, rollout.embedding)),
         "predictions": (jax.grad(predictions, (0, 1), allow_int=True), (params, rollout)),
         "objective": (jax.grad(representation, (0, 1), allow_int=True), (params, rollout)),
-        "imagine": (lambda p, s: behavior.imagine(nets, p, key, s, config.behavior.horizon), (params, start)),
+        "imagine": (imagined, (params, start)),
         "actor_critic": (jax.grad(actor_critic), (params,)),
         "optimizer": (optimizer.update, (params, moments, params)),
     }
@@ -130,5 +134,5 @@ def _bind(function: Callable[..., Any], args: tuple[Any, ...]) -> Callable[[], A
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("benchmarks.train_step")
     main()

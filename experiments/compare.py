@@ -189,5 +189,5 @@ main = command(
 )
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("experiments.compare")
     main()

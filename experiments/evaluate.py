@@ -135,5 +135,5 @@ EVALUATION = 0x65_76_61_6C  # sets these episodes apart from those of a run with
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("experiments.evaluate")
     main()

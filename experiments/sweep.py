@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import click
 
 from experiments.options import Name
-from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names
 
 POLL = 2.0  # seconds between two looks at the jobs
@@ -178,5 +177,4 @@ def launch(runs: Sequence[Run], executor: Any, at_once: int, echo: Callable[[str
 
 
 if __name__ == "__main__":
-    use_large_pages()
     main()

@@ -190,5 +190,5 @@ def configure(
 
 
 if __name__ == "__main__":
-    use_large_pages()
+    use_large_pages("experiments.train")
     main()

@@ -212,10 +212,11 @@ def parameter_counts(params: Params) -> dict[str, int]:
 
 
 def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
-    """The gradients; as much as seven or eight arrays of all imagined features; the encoder's, by frames."""
+    """The gradients; as much as some arrays of all imagined features; the encoder's, by frames."""
     steps = config.batch_size * config.batch_length
     imagined = 4 * feature * steps * (config.behavior.horizon + 1)
-    return 4 * sum(parameter_counts(params).values()) + 15 * imagined // 2 + 140_000 * steps
+    arrays = 7.5 if config.behavior.gradient == "reinforce" else 23.5  # the second keeps the world model's, too
+    return 4 * sum(parameter_counts(params).values()) + int(arrays * imagined) + 140_000 * steps
 
 
 def _compute_dtype(name: str) -> Any:

@@ -104,9 +104,10 @@ def imagine(
 
 
 def keep_products(apply: Callable[..., Any]) -> Callable[..., Any]:
-    """`Networks.apply` inside a scan, of which matrix products alone are kept for the gradient.
+    """`Networks.apply` for a scan, of which matrix products alone are kept for the gradient.
 
-    What lies between them is computed again: less work than to write it for every step and to read it back.
+    What lies between them is computed again: less work than to write it for every step and to read it back. (Outside a
+    scan the compiler may keep more.)
     """
 
     def call(name: str, params: Params, x: Array) -> Array:
@@ -147,19 +148,18 @@ def actor_critic_losses(
     slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)
 
     def judge(state: Array) -> Judgement:
+        apply = keep_products(nets.apply)
         fixed = jax.lax.stop_gradient(state)
-        logits = keep_products(nets.apply)("critic", params, fixed)
+        logits = apply("critic", params, fixed)
         seen = state if through_model else fixed
         return Judgement(
-            reward=twohot_mean(nets.apply("reward", frozen, seen), bins),
+            reward=twohot_mean(apply("reward", frozen, seen), bins),
             # The head's probability already contains the discount (see world_model.prediction_losses).
-            discount=jax.nn.sigmoid(nets.apply("continue", frozen, seen)[..., 0]),
-            value=twohot_mean(
-                nets.apply("critic", frozen, seen) if through_model else jax.lax.stop_gradient(logits), bins
-            ),
+            discount=jax.nn.sigmoid(apply("continue", frozen, seen)[..., 0]),
+            value=twohot_mean(apply("critic", frozen, seen) if through_model else jax.lax.stop_gradient(logits), bins),
             logits=logits,
             slow_value=slow_value(fixed),
-            policy=keep_products(nets.apply)("actor", params, fixed) if through_model else None,
+            policy=apply("actor", params, fixed) if through_model else None,
         )
 
     acting = {**frozen, "actor": params["actor"]}

@@ -219,6 +219,34 @@ def test_the_dynamics_gradient_comes_through_the_world_model(spec):
     assert not np.allclose(*(g["actor"]["actor"]["out"]["kernel"] for g in (gradients, other)))
 
 
+def test_the_entropys_gradient_stops_at_its_own_state():
+    """Also where the actor is trained through the world model: more entropy later is no reason for an action now."""
+    scale = 0.1
+    config = replace(CONFIG, gradient="dynamics", entropy=scale)
+    model = make(tiny.VECTORS, config)
+    without = make(tiny.VECTORS, replace(config, entropy=0.0))
+    nets = model.nets
+
+    @jax.jit
+    def run(params):
+        actor = lambda made: jax.grad(lambda p: made.compute(p, made.slow, made.batch, KEY)[0]["actor"])(params)[
+            "actor"
+        ]
+        _, (_, rollout) = model.compute(params, model.slow, model.batch, KEY)
+        _, _, features = frozen_trajectory(nets, params, rollout, KEY)
+        go_on = jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0])
+
+        def loss(actor):
+            distribution = policy(nets.heads, tiny.VECTORS.action, nets.apply("actor", {"actor": actor}, features[:-1]))
+            return jnp.mean(-jnp.cumprod(go_on, axis=0)[:-1] * scale * distribution.entropy())
+
+        return jax.tree.map(jnp.subtract, actor(model), actor(without)), jax.grad(loss)(params["actor"])
+
+    got, want = run(model.params)
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-2, atol=1e-3 * np.abs(y).max())
+
+
 def test_returns_are_normalised_by_no_less_than_the_floor():
     model = make(tiny.VECTORS, replace(CONFIG, return_floor=1e12))
     metrics = jax.jit(lambda: model.compute(model.params, model.slow, model.batch, KEY)[1][0][2])()
