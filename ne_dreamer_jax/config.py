@@ -104,7 +104,7 @@ def quickstart(size: str) -> Config:
         batch_length=16,
     )
     loop = LoopConfig(
-        env_steps=30_000, num_envs=8, replay_ratio=48.0, prefill=1_000, eval_every=10_000, eval_episodes=10
+        env_steps=20_000, num_envs=8, replay_ratio=96.0, prefill=1_000, eval_every=5_000, eval_episodes=10
     )
     return Config(EnvConfig("dmc/cheetah_run", image_size=32), agent, loop)
 
