@@ -247,8 +247,7 @@ class Row(NamedTuple):
     obs_error: float
     worst_obs: str
     free_run: int | None
-    p_value: float | None
-    dimensions: int | None
+    p_values: tuple[float, ...] | None  # of each dimension that a reset draws
     our_return: float | None
     their_return: float | None
     standard_errors: float | None
@@ -278,8 +277,7 @@ def measure(name: str, steps: int, free_steps: int, runs: int, resets: int, epis
         float(obs_errors[worst].max()),
         worst,
         agreement,
-        None if p_values is None else float(p_values.min()),
-        None if p_values is None else len(p_values),
+        None if p_values is None else tuple(map(float, p_values)),
         None if ours is None else float(ours.mean()),
         None if theirs is None else float(theirs.mean()),
         distance,
@@ -297,7 +295,7 @@ def format_row(row: Row) -> str:
         f"{row.reward_error:.1e}",
         f"{row.obs_error:.1e} ({row.worst_obs})",
         show(row.free_run, "d"),
-        f"{show(row.p_value, '.3f')} ({show(row.dimensions, 'd')})",
+        "-" if row.p_values is None else f"{min(row.p_values):.3f} ({len(row.p_values)})",
         f"{show(row.our_return, '.2f')} / {show(row.their_return, '.2f')} ({show(row.standard_errors, '.1f')})",
     )
     return "| " + " | ".join(cells) + " |"
@@ -339,7 +337,10 @@ def main(
         resets = episodes = 0
     click.echo(HEADER)
     for name in tasks or [name for name in registry.names() if name.startswith("dmc/")]:
-        click.echo(format_row(measure(name, steps, free_steps, runs, resets, episodes, fast)))
+        row = measure(name, steps, free_steps, runs, resets, episodes, fast)
+        click.echo(format_row(row))
+        if row.p_values is not None:
+            click.echo(f"{name}, reset p: " + " ".join(f"{p:.3f}" for p in row.p_values), err=True)
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def main(
                 "returns": [float(value) for value in returns],
                 "lengths": [int(value) for value in evaluation.lengths],
             }
-            where = {"mjx": " here" if len(evaluate) > 1 else ""}.get(place, f" in {place}")
+            where = f" in {place}" if len(evaluate) > 1 else ""
             click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
             if place == "mjx" and name == "policy" and with_video:
                 if evaluation.frames is None:
@@ -127,7 +127,7 @@ def allow_opengl() -> None:
     given = os.environ.get("MUJOCO_GL", "")
     if given.lower() not in (*_NO_OPENGL, *_OPENGL):
         raise ValueError(f"MUJOCO_GL: no way to draw is called {given!r}. {settings.did_you_mean(given, _OPENGL)}")
-    if os.environ.get("MUJOCO_GL", "disable").lower() in _NO_OPENGL:
+    if given.lower() in _NO_OPENGL:
         os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
 
 

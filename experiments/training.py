@@ -180,7 +180,8 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     shapes, first = run.shapes, jax.process_index() == 0
     if jax.process_count() > 1:  # each reads the whole and keeps its share
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
-    like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=())}  # type: ignore[arg-type]
+    apart: Any = ()
+    like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=apart)}
     if run.loop.frames is not None:
         like["frames"] = run.loop.frames.shapes
     began = time.perf_counter()

@@ -8,6 +8,7 @@ as never having stopped; where chunks begin and end changes none.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -180,14 +181,16 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         }
         return {**obs, **{name: put[name](frames.tickets(row), obs[name]) for name in images}}
 
-    def redraw(records: Array) -> Array:
+    def redraw(pictures: Any, records: Array) -> Array:
         flat = records.reshape(-1, records.shape[-1])
-        drawn = jax.lax.map(pictures.redraw, flat, batch_size=min(REDRAWN, len(flat)))  # type: ignore[union-attr]
+        drawn = jax.lax.map(pictures.redraw, flat, batch_size=min(REDRAWN, len(flat)))
         return drawn.reshape(*records.shape[:2], *drawn.shape[1:])
 
     def seen(obs: Mapping[str, Array]) -> Mapping[str, Array]:
         """The inverse of `kept`, for observations [B, T, ...] out of replay."""
-        back: dict[str, Callable[[Array], Array]] = {} if pictures is None else {"image": redraw}
+        back: dict[str, Callable[[Array], Array]] = {}
+        if pictures is not None:
+            back = {"image": partial(redraw, pictures)}
         if frames is not None:
             back = {name: partial(frames.get, name) for name in images}
         split = parallel.SPLIT
@@ -438,7 +441,7 @@ def _check_host(images: Mapping[str, Any]) -> None:
     except RuntimeError as error:
         raise ValueError(
             "loop.storage: 'host' needs JAX's cpu platform beside the accelerator's; expected both in JAX_PLATFORMS, "
-            f"such as 'cuda,cpu', got {jax.config.jax_platforms!r}."  # type: ignore[attr-defined]
+            f"such as 'cuda,cpu', got {os.environ.get('JAX_PLATFORMS', '')!r}."
         ) from error
 
 

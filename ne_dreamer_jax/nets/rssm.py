@@ -146,9 +146,8 @@ class RSSM(nn.Module):
         own = block_linear(state.astype(dtype), self.state_kernel.astype(dtype))
         x = own.reshape(-1, c.deter) + inputs @ self.input_kernel.astype(dtype) + self.hidden_bias.astype(dtype)[None]
         x = nn.silu(self.hidden_norm(x)).reshape(state.shape)
-        return per_block(_gate, (x, state), (self.gate_kernel.astype(dtype), self.gate_bias.astype(dtype))).reshape(
-            -1, c.deter
-        )
+        gates = self.gate_kernel.astype(dtype), self.gate_bias.astype(dtype)
+        return per_block(_gate, (x, state), gates).reshape(-1, c.deter)
 
     def prior(self, deter: Array) -> Array:
         """Logits of ``p(z_t | h_t)``: ``[..., D]`` to float32 ``[..., S, K]``, not yet mixed with the uniform."""
