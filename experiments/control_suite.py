@@ -117,7 +117,8 @@ def _play(players: list[Player], agent: Agent, params: Params, key: Array, rando
             rows[i] = players[i].step(actions[i])
             returns[i] += rows[i]["reward"]
             lengths[i] += 1
-    return Evaluation(jnp.asarray(returns, jnp.float32), jnp.asarray(lengths), np.stack(frames) if frames else None)
+    video = np.stack(frames) if frames else None
+    return Evaluation(jnp.asarray(returns, jnp.float32), jnp.asarray(lengths), jnp.ones(episodes, bool), video)
 
 
 def _stack(rows: list[dict[str, Any]]) -> TimeStep:

@@ -16,6 +16,11 @@ from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.loop import Loop, LoopState
 from ne_dreamer_jax.metrics import Counters
 
+NOTHING_LEARNED = (
+    "Nothing is learned in this run: it has no update. Raise loop.env_steps (--env-steps), or lower loop.prefill, the "
+    "number of agent steps before the first update."
+)
+
 
 def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     """The budget of a run in plain words, a line each."""
@@ -24,7 +29,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     counts = parameter_counts(shapes.train.params)
     modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
     agent_steps = schedule.total * schedule.num_envs
-    return [
+    lines = [
         f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, on {_devices(shapes)}",
         f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
         f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
@@ -33,6 +38,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
         f"  memory    replay holds {loop.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]
+    return lines if loop.updates or options.replay_ratio == 0 else [*lines, f"  WARNING   {NOTHING_LEARNED}"]
 
 
 def _devices(shapes: LoopState) -> str:
@@ -71,6 +77,8 @@ class Pace:
             parts.append(f"return {values['train/return']:.1f}")
         if "train/loss/total" in values:
             parts.append(f"loss {values['train/loss/total']:.4g}")
+        if values.get("train/bad_actions"):
+            parts.append(f"episodes cut by actions that are not finite: {values['train/bad_actions']:.0f}")
         if values.get("train/faults"):
             parts.append(f"episodes cut by broken physics: {values['train/faults']:.0f}")
         parts.append(self._left(step))

@@ -39,6 +39,14 @@ class Record:
                 return line[name]
         return None
 
+    def score(self, counters: Counters) -> float | None:
+        """What ranks the checkpoint at these counters: the return of its evaluation.
+
+        None where there was none, where an episode was cut short, or where parameters are not finite.
+        """
+        sound = self.find("eval/cut_episodes", counters) == 0 and self.find("eval/finite", counters) == 1
+        return self.find("eval/return", counters) if sound else None
+
     @property
     def random_return(self) -> tuple[float, float] | None:
         """Mean and standard deviation of a random policy's returns."""
@@ -70,10 +78,10 @@ class Saves:
             self._save(items, counters, score)
         self._last = time.monotonic()
 
-    def if_best(self, state: LoopState, counters: Counters, score: float) -> None:
-        """Saves the agent if no checkpoint has a higher evaluation return."""
+    def if_best(self, state: LoopState, counters: Counters, score: float | None) -> None:
+        """Saves the agent if no checkpoint has as high a score; one without a score is not the best."""
         best = checkpoint.best(checkpoint.checkpoints(self._directory))
-        beaten = best is None or best.score is None or score >= best.score
+        beaten = score is not None and (best is None or best.score is None or score > best.score)
         stopped_here, saves = parallel.agreed(bool(self._whole_at(counters)), beaten)
         if stopped_here:  # before this evaluation
             self.whole(state, counters, score)

@@ -18,7 +18,7 @@ class Schedule:
 
     total: int
     chunk: int
-    evaluation: int
+    evaluation: int | None  # steps between evaluations; None: there are none
     num_envs: int
     action_repeat: int
 
@@ -26,20 +26,25 @@ class Schedule:
     def of(cls, config: Config, loop: Loop) -> Schedule:
         """The schedule of a run."""
         num_envs, repeat = config.loop.num_envs, config.env.action_repeat
-        evaluation = max(1, round(config.loop.eval_every / (num_envs * repeat)))
+        every = config.loop.eval_every
+        evaluation = None if every is None else max(1, round(every / (num_envs * repeat)))
         return cls(loop.vector_steps, loop.chunk_steps, evaluation, num_envs, repeat)
 
     def end_of_chunk(self, step: int) -> int:
         """Where the chunk that starts at a step ends."""
-        after = (step // interval * interval + interval for interval in (self.chunk, self.evaluation))
+        after = (step // interval * interval + interval for interval in (self.chunk, self.evaluation) if interval)
         return min(self.total, *after)
 
     def evaluates(self, step: int) -> bool:
         """Whether an evaluation is due at a step."""
+        if self.evaluation is None:
+            return False
         return step == self.total or (step > 0 and step % self.evaluation == 0)
 
     def evaluations_after(self, step: int) -> int:
         """How many evaluations are still due after a step."""
+        if self.evaluation is None:
+            return 0
         regular = self.total // self.evaluation - step // self.evaluation
         return regular + (step < self.total and self.total % self.evaluation > 0)
 

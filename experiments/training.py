@@ -108,7 +108,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
                 if first:
                     draw(run, files, record)
                 if step < schedule.total:  # at the end everything is saved below
-                    saves.if_best(state, counters, values["eval/return"])
+                    saves.if_best(state, counters, record.score(counters))
             (stopped_by,) = parallel.agreed(stop.signal or 0)
             if step == schedule.total or stopped_by:
                 break
@@ -124,8 +124,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
             record.write(counters, values)
             echo(pace.line(before, counters, values, seconds))
             if saves.due():
-                saves.whole(state, counters, record.find("eval/return", counters))
-        saves.whole(state, counters, record.find("eval/return", counters))
+                saves.whole(state, counters, record.score(counters))
+        saves.whole(state, counters, record.score(counters))
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
             return 128 + stopped_by
@@ -158,10 +158,16 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
     evaluation = run.loop.evaluate(state.train.params, policy_key, frames=True)
     values |= _returns(evaluation, "eval/")
     values["time/evaluation_seconds"] = seconds = time.perf_counter() - began
+    values["eval/cut_episodes"] = cut = int((~np.asarray(evaluation.complete)).sum())
+    values["eval/finite"] = finite = bool(_finite(state.train.params))
     echo(
         f"Evaluation: return {values['eval/return']:.1f} ± {values['eval/return_std']:.1f} over "
         f"{len(evaluation.returns)} episodes, in {progress.duration(seconds)}."
     )
+    if not finite:
+        echo("The agent has diverged: some of its parameters are not finite. It is not kept as the best.")
+    elif cut:
+        echo(f"{cut} of the episodes were cut short by broken physics, so that this agent is not kept as the best.")
     return values, evaluation.frames
 
 
@@ -226,12 +232,18 @@ def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax
     return compiled
 
 
+@jax.jit
+def _finite(params: Any) -> jax.Array:
+    """Whether all parameters are finite numbers."""
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(params)]).all()
+
+
 def _named(values: Mapping[str, Any], before: Counters, after: Counters, seconds: float) -> dict[str, Any]:
     """A chunk's metrics under their names; means over no episode or over no update are left out."""
     of_episodes = {"return", "length"}
     absent = set() if values["episodes"] > 0 else of_episodes
     if after.update == before.update:
-        absent |= set(values) - of_episodes - {"episodes", "faults"}
+        absent |= set(values) - of_episodes - {"episodes", "faults", "bad_actions"}
     rates = {
         "time/chunk_seconds": seconds,
         "time/env_steps_per_second": (after.env_step - before.env_step) / seconds,
@@ -248,6 +260,8 @@ def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
 def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
     mean, deviation = record.find("eval/return"), record.find("eval/return_std")
     lines = [f"Finished {run.config.loop.env_steps:,} environment steps of {run.config.env.task}."]
+    if run.loop.updates == 0:
+        lines.append(progress.NOTHING_LEARNED)
     if mean is not None and deviation is not None and record.random_return is not None:
         lines.append(
             f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "

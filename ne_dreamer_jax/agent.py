@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from ne_dreamer_jax import behavior, drqv2, optim, shapes, world_model
+from ne_dreamer_jax import behavior, drqv2, optim, ranges, shapes, world_model
 from ne_dreamer_jax.behavior import BehaviorConfig
 from ne_dreamer_jax.drqv2 import DrQv2Config
 from ne_dreamer_jax.nets.encoder import EncoderConfig
@@ -20,6 +20,7 @@ from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.optim import OptimizerConfig
+from ne_dreamer_jax.ranges import NonNegative, Range
 from ne_dreamer_jax.types import (
     Array,
     ArraySpec,
@@ -57,14 +58,17 @@ class AgentConfig:
     objective: AnyObjective = field(default_factory=NextEmbedding)
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    loss_scales: Mapping[str, float] = field(default_factory=lambda: {**BASE_LOSS_SCALES, "next_embedding": 1.0})
+    loss_scales: Mapping[str, NonNegative] = field(default_factory=lambda: {**BASE_LOSS_SCALES, "next_embedding": 1.0})
     """Weight of every named loss; the keys must be exactly the names of the losses."""
-    batch_size: int = 16
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 16
     """B, sequences in a batch."""
-    batch_length: int = 64
+    batch_length: Annotated[int, Range(1, 1_000_000)] = 64
     """T, steps in a sequence."""
-    compute_dtype: str = "float32"
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
     @property
     def method(self) -> str:
@@ -220,10 +224,7 @@ def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
 
 
 def _compute_dtype(name: str) -> Any:
-    allowed = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
-    if name not in allowed:
-        raise ValueError(f"agent.compute_dtype: expected one of {list(allowed)}, got {name!r}.")
-    return allowed[name]
+    return {"float32": jnp.float32, "bfloat16": jnp.bfloat16}[name]
 
 
 def _check_loss_scales(config: AgentConfig) -> None:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import (
     critic_loss,
     dynamics_loss,
@@ -26,39 +27,45 @@ from ne_dreamer_jax.losses import (
 from ne_dreamer_jax.nets.heads import model_action, policy
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSM, feature
+from ne_dreamer_jax.ranges import NonNegative, Positive, Range, Share, ShareBelowOne
 from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
 
 LOSSES = ("actor", "critic", "replay_critic")
+
+
+Percentile = Annotated[float, Range(0.0, 100.0)]
 
 
 @dataclass(frozen=True)
 class BehaviorConfig:
     """Settings of the actor-critic."""
 
-    horizon: int = 15
+    horizon: Annotated[int, Range(1, 10_000)] = 15
     """H, imagined steps."""
-    discount: float = 0.997
+    discount: ShareBelowOne = 0.997
     """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
-    lam: float = 0.95
+    lam: Share = 0.95
     """lambda of the returns."""
-    entropy: float = 3e-4
+    entropy: NonNegative = 3e-4
     """eta, scale of the policy's entropy."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
-    slow_rate: float = 0.02
+    slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
     """Share of the critic that moves into the slow critic at each update."""
-    slow_scale: float = 1.0
+    slow_scale: NonNegative = 1.0
     """Weight of the critic's regularisation towards the slow critic."""
-    return_decay: float = 0.99
+    return_decay: ShareBelowOne = 0.99
     """Decay of the moving percentiles of the returns."""
-    return_percentiles: tuple[float, float] = (5.0, 95.0)
+    return_percentiles: tuple[Percentile, Percentile] = (5.0, 95.0)
     """The returns are normalised by the range between these."""
-    return_floor: float = 1.0
+    return_floor: Positive = 1.0
     """Returns are never divided by less."""
 
     def __post_init__(self) -> None:
-        if self.gradient not in ("reinforce", "dynamics"):
-            raise ValueError(f"behavior.gradient: expected 'reinforce' or 'dynamics', got {self.gradient!r}.")
+        ranges.check(self)
+        low, high = self.return_percentiles
+        if low >= high:
+            raise ValueError(f"behavior.return_percentiles: expected the first below the second, got {low} and {high}.")
 
 
 class Trajectory(NamedTuple):

@@ -163,8 +163,8 @@ def checkpoints(directory: Path) -> list[Checkpoint]:
 
 
 def best(found: Collection[Checkpoint]) -> Checkpoint | None:
-    """The checkpoint with the highest score, the newest of equals; None where none has a score."""
-    scored = [(checkpoint.score, checkpoint.step, checkpoint) for checkpoint in found if checkpoint.score is not None]
+    """The checkpoint with the highest score, the earliest of equals; None where none has a score."""
+    scored = [(checkpoint.score, -checkpoint.step, checkpoint) for checkpoint in found if checkpoint.score is not None]
     return max(scored, key=lambda entry: entry[:2])[2] if scored else None
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from ne_dreamer_jax import drqv2, settings
+from ne_dreamer_jax import drqv2, ranges, settings
 from ne_dreamer_jax.agent import AgentConfig
 from ne_dreamer_jax.behavior import BehaviorConfig
 from ne_dreamer_jax.drqv2 import DrQv2Config
@@ -21,6 +21,7 @@ from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.optim import OptimizerConfig
+from ne_dreamer_jax.ranges import LARGEST, Range
 from ne_dreamer_jax.settings import did_you_mean
 from ne_dreamer_jax.world_model import WorldModelConfig
 
@@ -43,12 +44,15 @@ class EnvConfig:
     task: str = "dmc/walker_walk"
     obs: Literal["pixels", "vector", "both"] = "pixels"
     """pixels, vector or both."""
-    action_repeat: int = 2
+    action_repeat: Annotated[int, Range(1, 1_000_000)] = 2
     """Environment steps for which each action is held; rewards are summed."""
-    image_size: int = 64
+    image_size: Annotated[int, Range(1, 4_096)] = 64
     """Height and width of the frames."""
     fast: bool = False
     """Whether contacts are solved with a shorter line search than MuJoCo's; benchmarks/DMC.md measures the error."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,10 @@ class Config:
     env: EnvConfig = field(default_factory=EnvConfig)
     agent: AgentConfig | DrQv2Config = field(default_factory=AgentConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
-    seed: int = 0
+    seed: Annotated[int, Range(0, LARGEST)] = 0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
     @property
     def method(self) -> str:

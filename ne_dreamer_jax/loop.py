@@ -13,16 +13,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from ne_dreamer_jax import host_frames, memory, parallel
+from ne_dreamer_jax import host_frames, memory, parallel, ranges
 from ne_dreamer_jax import replay as replay_lib
 from ne_dreamer_jax.host_frames import HostFrames
+from ne_dreamer_jax.ranges import Count, CountOrNone, Range
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
 
 PAPER_CAPACITY = 5_000_000
@@ -34,21 +35,21 @@ REDRAWN = 64  # frames drawn together out of replay, so that what lies between s
 class LoopConfig:
     """Settings of the training loop. One agent step is ``env.action_repeat`` environment steps of one environment."""
 
-    env_steps: int = 1_000_000
+    env_steps: Annotated[int, Range(1, 10**15)] = 1_000_000
     """Environment steps in all, over all environments."""
-    num_envs: int = 16
+    num_envs: Annotated[int, Range(1, 10_000_000)] = 16
     """N, environments stepped together."""
-    replay_ratio: float = 512.0
-    """Replayed steps for each agent step; an update replays B * T."""
-    capacity: int | None = None
+    replay_ratio: Annotated[float, Range(0.0, 1e6)] = 512.0
+    """Replayed steps for each agent step; an update replays B * T. 0 never learns."""
+    capacity: Annotated[int, Range(1, 10**15)] | None = None
     """Transitions that replay holds; none: what the run can fill, at most the paper's 5e6."""
-    prefill: int = 4_096
+    prefill: CountOrNone = 4_096
     """Agent steps before the first update."""
-    chunk_steps: int = 64
+    chunk_steps: Count = 64
     """Vector steps (agent steps of each environment) of one call to the device, unless that is too many updates."""
-    eval_every: int = 50_000
-    """Environment steps between evaluations."""
-    eval_episodes: int = 10
+    eval_every: Annotated[int, Range(1, 10**15)] | None = 50_000
+    """Environment steps between evaluations, of which there is one at the end too; none: no evaluation at all."""
+    eval_episodes: Annotated[int, Range(1, 1_000_000)] = 10
     """Episodes of an evaluation, on environments of their own."""
     write_latents: bool = True
     """Whether the posterior latents of an update replace those in replay."""
@@ -60,6 +61,9 @@ class LoopConfig:
     storage: Literal["pixels", "states", "host"] = "pixels"
     """What replay keeps of an image: its pixels; its state, which takes a fraction of the memory and is drawn again, to
     the same bits, whenever it is sampled; or its pixels in the host's memory, from where they travel to the device."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
 
 class Counters(NamedTuple):
@@ -93,6 +97,7 @@ class Evaluation(NamedTuple):
 
     returns: Array  # float32 [M]
     lengths: Array  # int32 [M], agent steps
+    complete: Array  # bool [M], False where broken physics or an action that was not finite cut the episode short
     frames: Any  # uint8 numpy [steps, H, W, 3] of the first environment's episode, or None
 
 
@@ -144,6 +149,12 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         raise ValueError(f"loop.replay_ratio: expected 0 (never learn) or at least 0.001, got {config.replay_ratio}")
     price = b * length * ratio.denominator  # of one update, in units of credit
     wage = n * ratio.numerator  # of one vector step
+    if price + wage >= 2**31 or vector_steps >= 2**31:
+        raise ValueError(
+            "expected a budget that can be counted in 32 bits, got "
+            f"loop.env_steps {config.env_steps:,} in {n:,} environments at loop.replay_ratio {config.replay_ratio:g}; "
+            "take more environments, or a ratio of a smaller denominator"
+        )
     prefill = max(-(-config.prefill // n), length + 1)
     updates = max(0, vector_steps - prefill) * wage // price
     least = (length + 1) * n
@@ -325,7 +336,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         metric_shapes = jax.eval_shape(agent.train_step, state.train, batch)[2]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metric_shapes)
         episode_sums = {name: jnp.zeros(()) for name in ("return", "length", "episodes")}
-        before, faults_before = state.train.update, jnp.sum(state.env.faults)
+        before = state.train.update
+        cuts_before = jnp.sum(state.env.faults), jnp.sum(state.env.bad_actions)
         state, sums, episode_sums = jax.lax.fori_loop(
             0, steps, lambda _, carry: vector_step(*carry), (state, sums, episode_sums)
         )
@@ -334,19 +346,23 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         metrics = {name: value / count for name, value in sums.items()}
         finished = episode_sums.pop("episodes")
         metrics |= {name: value / finished for name, value in episode_sums.items()} | {"episodes": finished}
-        # Episodes that the environments cut because their physics broke down.
-        metrics["faults"] = (jnp.sum(state.env.faults) - faults_before).astype(jnp.float32)
+        # Episodes that the environments cut: because their physics broke down, or an action was not finite.
+        for name, count, earlier in zip(
+            ("faults", "bad_actions"), (state.env.faults, state.env.bad_actions), cuts_before, strict=True
+        ):
+            metrics[name] = (jnp.sum(count) - earlier).astype(jnp.float32)
         return state, metrics
 
     def eval_init(key: Array, episodes: int) -> tuple:
         env_key, key = jax.random.split(key)
         env_state = prepare_envs(jax.random.split(env_key, episodes))
         zeros = jnp.zeros((episodes,))
-        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), zeros > 0)
+        no = zeros > 0
+        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), no, no)
 
     def eval_steps(params: Any, carry: tuple, random: Array, frames: bool) -> tuple[tuple, Any]:
         def step(carry: tuple, _: None) -> tuple[tuple, Any]:
-            env_state, policy, key, returns, lengths, done = carry
+            env_state, policy, key, returns, lengths, complete, done = carry
             key, act_key, random_key = jax.random.split(key, 3)
             env_state, timestep = step_envs(env_state, policy.prev_action)
             policy, action = agent.act(params, policy, timestep, act_key, mode="mode")
@@ -355,9 +371,10 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
             counts = ~done
             returns = returns + jnp.where(counts, timestep.reward, 0.0)
             lengths = lengths + (counts & ~timestep.is_first).astype(jnp.int32)
+            complete = jnp.where(counts, env_state.faults + env_state.bad_actions == 0, complete)
             done = done | timestep.is_last
             seen = (timestep.obs["image"][0], counts[0]) if frames else None
-            return (env_state, policy, key, returns, lengths, done), seen
+            return (env_state, policy, key, returns, lengths, complete, done), seen
 
         return jax.lax.scan(step, carry, None, length=config.chunk_steps)
 
@@ -378,7 +395,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         video = None
         if clips:
             video = np.concatenate(clips)
-        return Evaluation(carry[3], carry[4], video)
+        return Evaluation(carry[3], carry[4], carry[5], video)
 
     whole = None if mesh is None else parallel.NamedSharding(mesh, parallel.WHOLE)
     out = None if mesh is None else (shardings, whole)

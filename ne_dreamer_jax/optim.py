@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-import difflib
+import math
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import optax
+
+from ne_dreamer_jax import ranges
+from ne_dreamer_jax.ranges import CountOrNone, Positive, Range, ShareBelowOne
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
     """The defaults are the paper's table; warm-up and the floor of the clipping are DreamerV3's."""
 
-    name: str = "adam"  # or "laprop", which the authors' released code and DreamerV3 use
-    learning_rate: float = 4e-5
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-20
-    agc: float = 0.3  # a tensor's gradient norm is at most this share of the tensor's own; math.inf for no clipping
-    agc_pmin: float = 1e-3  # a tensor's norm counts as at least this, so that zeros can grow
-    warmup: int = 1000  # updates until the full learning rate; 0 for none
+    name: Literal["adam", "laprop"] = "adam"
+    """laprop is what the authors' released code and DreamerV3 use."""
+    learning_rate: Positive = 4e-5
+    beta1: ShareBelowOne = 0.9
+    beta2: ShareBelowOne = 0.999
+    eps: Positive = 1e-20
+    agc: Annotated[float, Range(0.0, math.inf, above=True)] = 0.3
+    """A tensor's gradient norm is at most this share of the tensor's own; inf for no clipping."""
+    agc_pmin: Positive = 1e-3
+    """A tensor's norm counts as at least this, so that zeros can grow."""
+    warmup: CountOrNone = 1000
+    """Updates until the full learning rate; 0 for none."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
 
 def clip_per_tensor(clip: float, pmin: float) -> optax.GradientTransformation:
@@ -55,9 +66,6 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
 
     With the default epsilon only gradients that are exactly zero, or whose squares underflow in float32 (below about
     1e-18), feel it; zero gradients give zero updates.
-
-    Raises:
-      ValueError: for an unknown name, or a number out of its range.
     """
     b1, b2, eps = config.beta1, config.beta2, config.eps
     rules = {
@@ -66,15 +74,6 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
             optax.scale_by_rms(b2, eps, eps_in_sqrt=False, bias_correction=True), optax.ema(b1)
         ),
     }
-    if config.name not in rules:
-        close = difflib.get_close_matches(config.name.lower(), rules, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"expected an optimizer out of {sorted(rules)}, got {config.name!r}{hint}")
-    for field in ("learning_rate", "eps", "agc", "agc_pmin"):
-        if not getattr(config, field) > 0:
-            raise ValueError(f"expected optimizer.{field} > 0, got {getattr(config, field)}")
-    if config.warmup < 0:
-        raise ValueError(f"expected optimizer.warmup >= 0 updates, got {config.warmup}")
 
     def learning_rate(update: jax.Array) -> jax.Array:
         ramp = (update.astype(jnp.float32) + 1.0) / max(config.warmup, 1)

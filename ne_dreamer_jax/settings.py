@@ -11,10 +11,11 @@ from __future__ import annotations
 import collections.abc
 import dataclasses
 import difflib
-import types
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeGuard, TypeVar
+
+from ne_dreamer_jax import ranges
 
 T = TypeVar("T")
 TAG = "type"  # the key of the class name in JSON, where a field may hold one of several dataclasses
@@ -32,7 +33,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """The end of an error message for an unknown name: its nearest matches, or all names where none is near."""
     names = list(known)
     near = nearest(word, names)
-    return f"Did you mean {_either(near)}?" if near else f"Known: {', '.join(names)}."
+    return f"Did you mean {ranges.either(near)}?" if near else f"Known: {', '.join(names)}."
 
 
 def override(config: T, assignment: str) -> T:
@@ -98,25 +99,19 @@ def _show(value: Any, missing: object) -> str:
     return "absent" if value is missing else repr(value)
 
 
-def _either(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
-
-
 def _example(config: Any) -> str:
     path, value = next(iter(paths(config).items()), ("field", "value"))
     return f"{path}={as_text(value)}"
 
 
 def _fields(cls: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
+    hints = ranges.hints_of(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
 def _choices(annotation: Any) -> list[Any]:
-    """The members of a union, or the annotation alone."""
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return list(typing.get_args(annotation))
-    return [annotation]
+    """The members of a union, or the annotation alone, without their ranges."""
+    return [ranges.plain(choice) for choice in ranges.choices(ranges.plain(annotation))]
 
 
 def _dataclasses(annotation: Any) -> dict[str, type]:
@@ -165,10 +160,12 @@ def _replace(value: Any, annotation: Any, names: list[str], text: str, done: lis
 def _parse(annotation: Any, text: str, path: str) -> Any:
     for choice in sorted(_choices(annotation), key=lambda choice: choice is str):  # str takes anything: ask it last
         try:
-            return _parse_one(choice, text, path)
+            value = _parse_one(choice, text, path)
         except _Unfit:
             continue
-    raise ValueError(f"{path}: expected {_describe(annotation)}, got {text!r}")
+        ranges.check_value(annotation, value, path)
+        return value
+    raise ValueError(f"{path}: expected {ranges.describe(annotation)}, got {text!r}")
 
 
 class _Unfit(Exception):
@@ -222,23 +219,6 @@ def _number(text: str) -> float:
         raise _Unfit from None
 
 
-def _describe(annotation: Any) -> str:
-    names = {bool: "true or false", int: "an integer", float: "a number", str: "a text", type(None): "none"}
-    words = []
-    for choice in _choices(annotation):
-        if typing.get_origin(choice) is typing.Literal:
-            words += [str(member) for member in typing.get_args(choice)]
-        elif typing.get_origin(choice) is tuple:
-            arguments = typing.get_args(choice)
-            count = "any number of" if ... in arguments else str(len(arguments))
-            words.append(f"{count} values joined with commas, each {_describe(arguments[0])}")
-        elif _is_mapping(choice):
-            words.append("a member, as path.name=value")
-        else:
-            words.append(names.get(choice, getattr(choice, "__name__", str(choice))))
-    return _either(words)
-
-
 def _encode(annotation: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         tag = {TAG: type(value).__name__} if len(_dataclasses(annotation)) > 1 else {}
@@ -254,10 +234,12 @@ def _encode(annotation: Any, value: Any) -> Any:
 def _decode(annotation: Any, data: Any, path: str) -> Any:
     for choice in _choices(annotation):
         try:
-            return _decode_one(choice, data, path, tagged=len(_dataclasses(annotation)) > 1)
+            value = _decode_one(choice, data, path, tagged=len(_dataclasses(annotation)) > 1)
         except _Unfit:
             continue
-    raise ValueError(f"{path}: expected {_describe(annotation)}, got {data!r}")
+        ranges.check_value(annotation, value, path)
+        return value
+    raise ValueError(f"{path}: expected {ranges.describe(annotation)}, got {data!r}")
 
 
 def _decode_one(annotation: Any, data: Any, path: str, *, tagged: bool) -> Any:

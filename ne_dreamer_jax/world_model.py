@@ -12,10 +12,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import balanced_kl, symexp_bins, twohot_loss
 from ne_dreamer_jax.nets.heads import encode_action
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSM, feature, mask_first, observe
+from ne_dreamer_jax.ranges import NonNegative, Share
 from ne_dreamer_jax.types import Array, Batch, Latent, Metrics, Params, PolicyState, Rollout, TimeStep
 
 LOSSES = ("dynamics", "representation", "reward", "continue")
@@ -25,10 +27,13 @@ LOSSES = ("dynamics", "representation", "reward", "continue")
 class WorldModelConfig:
     """Settings of the world-model losses."""
 
-    free_nats: float = 1.0
+    free_nats: NonNegative = 1.0
     """Below this KL, summed over the latents, neither side is trained by it."""
-    kl_unimix: float = 0.01
+    kl_unimix: Share = 0.01
     """Share of the uniform distribution mixed into both sides of the KL; 0 is the released code."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
 
 def posterior_rollout(nets: Networks, params: Params, key: Array, batch: Batch) -> tuple[Rollout, Array]:

@@ -253,9 +253,9 @@ def test_returns_are_normalised_by_no_less_than_the_floor():
     assert metrics["imagined/return_scale"] == jnp.float32(1e12)
 
 
-def test_the_gradient_has_a_known_name():
-    with pytest.raises(ValueError, match=r"behavior.gradient: expected 'reinforce' or 'dynamics', got 'dynamic'"):
-        BehaviorConfig(gradient="dynamic")  # type: ignore[arg-type]
+def test_percentiles_are_in_order():
+    with pytest.raises(ValueError, match=r"return_percentiles: expected the first below the second, got 95.0 and 5.0"):
+        BehaviorConfig(return_percentiles=(95.0, 5.0))
 
 
 def test_imagined_latents_are_samples_of_the_prior():

@@ -71,7 +71,8 @@ def test_methods_differ_in_the_objective_and_the_weights_of_its_losses(method):
     assert stored["agent"]["objective"]["type"] == type(config.agent.objective).__name__
     assert settings.from_dict(Config, stored) == config
     assert config.agent.loss_scales == {**BASE_LOSS_SCALES, **config.agent.objective.losses}
-    assert replace(config.agent, objective=None, loss_scales={}) == replace(base.agent, objective=None, loss_scales={})
+    shared = {"objective": NoObjective(), "loss_scales": {}}
+    assert replace(config.agent, **shared) == replace(base.agent, **shared)
     for other in configs.METHODS:  # by whatever way
         assert (
             configs.with_method(configs.with_method(base, other), method).agent.loss_scales == config.agent.loss_scales

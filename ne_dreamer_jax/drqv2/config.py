@@ -7,6 +7,10 @@ configuration (github.com/facebookresearch/drqv2, ``cfgs/``), which the publishe
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+from ne_dreamer_jax import ranges
+from ne_dreamer_jax.ranges import Count, CountOrNone, NonNegative, Positive, Range, Share, Width
 
 DIFFICULTY = {
     "dmc/acrobot_swingup": "medium",
@@ -46,38 +50,41 @@ IMAGE_SIZE = 84
 class DrQv2Config:
     """Everything that defines a DrQ-v2 agent and its update."""
 
-    frame_stack: int = 3
+    frame_stack: Annotated[int, Range(1, 1_000)] = 3
     """Observations that the agent sees together: the last of the episode; at its start its first one, repeated."""
-    n_step: int = 3
+    n_step: Annotated[int, Range(1, 10_000)] = 3
     """Rewards in a target before it bootstraps."""
-    discount: float = 0.99
-    batch_size: int = 256
+    discount: Share = 0.99
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 256
     """B, transitions in an update."""
-    channels: int = 32
+    channels: Width = 32
     """Channels of each of the four convolutions."""
-    features: int = 50
+    features: Width = 50
     """Width of the normalised bottleneck between encoder and heads."""
-    units: int = 1024
+    units: Width = 1024
     """Width of the heads' two hidden layers."""
-    learning_rate: float = 1e-4
+    learning_rate: Positive = 1e-4
     """Of Adam, for encoder, actor and critic alike."""
-    target_rate: float = 0.01
+    target_rate: Share = 0.01
     """Share of the critic that its moving average takes over at each update."""
-    shift: int = 4
+    shift: Annotated[int, Range(0, 10_000)] = 4
     """Images are shifted by up to this many pixels in each direction, as a random crop of the padded image."""
-    noise_first: float = 1.0
+    noise_first: NonNegative = 1.0
     """Standard deviation of the policy at the start."""
-    noise_last: float = 0.1
+    noise_last: NonNegative = 0.1
     """Standard deviation of the policy once `noise_steps` have passed."""
-    noise_steps: int = NOISE_STEPS["easy"]
+    noise_steps: Count = NOISE_STEPS["easy"]
     """Agent steps over which the standard deviation falls linearly."""
-    noise_clip: float = 0.3
+    noise_clip: NonNegative = 0.3
     """Bound of the noise in the actions of an update (not in those of acting)."""
-    random_steps: int = SEED_FRAMES // 2
+    random_steps: CountOrNone = SEED_FRAMES // 2
     """Agent steps of uniformly random actions; the first update comes right after them."""
-    steps_per_update: float = 2.0
+    steps_per_update: Positive = 2.0
     """Agent steps that go by for each update. The noise in an update follows from it; how often the loop learns is
     ``loop.replay_ratio`` = batch_size * (frame_stack + n_step) / steps_per_update."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
     @property
     def batch_length(self) -> int:

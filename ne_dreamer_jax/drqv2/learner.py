@@ -63,7 +63,6 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
     Raises ValueError where the environment does not fit (discrete actions, images too small), and for a setting out
     of its range.
     """
-    _check(config)
     nets = Networks.build(config, spec)
     adam = optax.flatten(optax.adam(config.learning_rate))  # one vector: few kernels to compile and to launch
 
@@ -179,12 +178,6 @@ def _of_critic(params: Params) -> dict[str, Params]:
 def _mean(x: Array, valid: Array) -> Array:
     weight = valid.astype(jnp.float32)
     return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
-
-
-def _check(config: DrQv2Config) -> None:
-    for name in ("frame_stack", "n_step", "batch_size", "noise_steps"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"agent.{name}: expected at least 1, got {getattr(config, name)}.")
 
 
 def _observations(spec: EnvSpec, lead: tuple[int, ...]) -> dict[str, Any]:

@@ -7,7 +7,6 @@ simulations that stop being finite. Everything is written for ONE environment; `
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -40,8 +39,9 @@ class Core(NamedTuple):
     """A simulation as pure functions.
 
     ``step(state, action, restart, key)`` advances by one step or, where the bool ``restart`` is set, returns what
-    ``reset(key)`` would; action and progress are then without meaning. Starting inside of ``step`` lets a simulation
-    share code, and so compile time, between the two; ``restart_or_step`` is for those that have nothing to share.
+    ``reset(key)`` would; action and progress are then without meaning. The key is a new one at every step, for
+    simulations that are stochastic. Starting inside of ``step`` lets a simulation share code, and so compile time,
+    between the two; ``restart_or_step`` is for those that have nothing to share.
     """
 
     spec: EnvSpec
@@ -49,6 +49,7 @@ class Core(NamedTuple):
     step: Callable[[CoreState, Array, Array, Array], tuple[CoreState, Progress]]
     observe: Callable[[CoreState], dict[str, Array]]  # as spec.observation; the only place where pixels are drawn
     pictures: Pictures | None = None  # where the observation has an "image" that can be drawn again
+    blank: Callable[[], CoreState] | None = None  # a state for ``step`` to begin the first episode from; none: zeros
 
 
 class EnvState(NamedTuple):
@@ -56,8 +57,10 @@ class EnvState(NamedTuple):
 
     core: CoreState
     key: Array  # typed key [], what the coming episodes are drawn from
+    steps: Array  # int32 [], steps of the running episode
     needs_reset: Array  # bool [], the last time step was the last of its episode
     faults: Array  # int32 [], episodes cut because the simulation broke down, since reset
+    bad_actions: Array  # int32 [], episodes cut because an action was not finite, since reset
 
     @property
     def physics(self) -> Any:
@@ -96,12 +99,16 @@ def if_needed(needed: Array, compute: Callable[[], T], otherwise: T) -> T:
 
 
 def restart_or_step(
-    reset: Callable[[Array], CoreState], step: Callable[[CoreState, Array], tuple[CoreState, Progress]]
+    reset: Callable[[Array], CoreState], step: Callable[..., tuple[CoreState, Progress]], stochastic: bool = False
 ) -> Callable[[CoreState, Array, Array, Array], tuple[CoreState, Progress]]:
-    """Makes a ``Core.step`` out of a plain ``step(state, action)`` and the core's ``reset``."""
+    """Makes a ``Core.step`` out of a plain step and the core's ``reset``.
+
+    Args:
+      step: (state, action) -> new state and progress; where ``stochastic``, (state, action, key).
+    """
 
     def step_or_restart(state: CoreState, action: Array, restart: Array, key: Array) -> tuple[CoreState, Progress]:
-        state, progress = step(state, action)
+        state, progress = step(state, action, key) if stochastic else step(state, action)
         return if_needed(restart, lambda: reset(key), state), progress
 
     return step_or_restart
@@ -112,52 +119,141 @@ def from_core(core: Core) -> Env:
 
     Where the simulation says that it broke down, or its reward or observation is not finite, the episode ends
     there (``is_last``, not ``is_terminal``) with reward 0 and zeros for the non-finite components of the
-    observation, and ``EnvState.faults`` counts it.
-    """
+    observation, and ``EnvState.faults`` counts it. An action that is not finite, which is no fault of the simulation,
+    ends the episode likewise, and ``EnvState.bad_actions`` counts it.
 
-    def emit(
-        state: CoreState, key: Array, faults: Array, is_first: Array, progress: Progress
-    ) -> tuple[EnvState, TimeStep]:
+    Raises:
+      ValueError: the core's functions do not fit each other or the specification (the message says which, with what
+        was expected and what was got); from ``step``, an action of another shape or dtype than the specification's.
+    """
+    _check_core(core)
+
+    def emit(stepped: CoreState, state: EnvState, progress: Progress, finite: Array) -> tuple[EnvState, TimeStep]:
+        """The time step of a core's state; ``state`` has the counts before it."""
+        is_first = state.needs_reset
         nothing = Progress(jnp.zeros((), jnp.float32), *jnp.array([False, False, True]))
         progress = jax.tree.map(lambda first, later: jnp.where(is_first, first, later), nothing, progress)
-        obs = core.observe(state)
+        seen = core.observe(stepped)
+        obs = {name: jnp.asarray(seen[name], spec.dtype) for name, spec in core.spec.observation.items()}
         sound = progress.is_sound & jnp.isfinite(progress.reward)
         for value in obs.values():
             sound &= jnp.isfinite(value).all()
+        cut = ~(sound & finite)
         timestep = TimeStep(
             obs={name: jnp.where(jnp.isfinite(value), value, jnp.zeros_like(value)) for name, value in obs.items()},
-            reward=jnp.where(sound, progress.reward, nothing.reward),
+            reward=jnp.where(cut, nothing.reward, progress.reward),
             is_first=is_first,
-            is_last=progress.is_last | ~sound,
-            is_terminal=progress.is_terminal & sound,
+            is_last=progress.is_last | cut,
+            is_terminal=progress.is_terminal & ~cut,
         )
-        return EnvState(state, key, timestep.is_last, faults + (~sound).astype(jnp.int32)), timestep
-
-    def reset(key: Array) -> tuple[EnvState, TimeStep]:
-        key, episode_key = jax.random.split(key)
-        first = jnp.ones((), bool)
-        progress = Progress(jnp.zeros((), jnp.float32), ~first, ~first, first)
-        return emit(core.reset(episode_key), key, jnp.zeros((), jnp.int32), first, progress)
+        state = state._replace(
+            core=stepped,
+            needs_reset=timestep.is_last,
+            faults=state.faults + (~sound).astype(jnp.int32),
+            bad_actions=state.bad_actions + (~finite).astype(jnp.int32),
+        )
+        return state, timestep
 
     def step(state: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
-        if isinstance(core.spec.action, ContinuousAction):
-            action = jnp.clip(action, -1.0, 1.0)
-        key, episode_key = jax.random.split(state.key)
-        key = jnp.where(state.needs_reset, key, state.key)
-        stepped, progress = core.step(state.core, action, state.needs_reset, episode_key)
-        return emit(stepped, key, state.faults, state.needs_reset, progress)
+        spec = core.spec.action
+        _expect("action", _described(jax.ShapeDtypeStruct(spec.shape, spec.dtype)), _described(action))
+        finite = jnp.ones((), bool)
+        if isinstance(spec, ContinuousAction):
+            finite = jnp.isfinite(action).all() | state.needs_reset
+            action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action))
+        key, episode_key, steps_key = jax.random.split(state.key, 3)
+        new_key = jnp.where(state.needs_reset, episode_key, jax.random.fold_in(steps_key, state.steps))
+        stepped, progress = core.step(state.core, action, state.needs_reset, new_key)
+        state = state._replace(
+            key=jnp.where(state.needs_reset, key, state.key), steps=jnp.where(state.needs_reset, 0, state.steps + 1)
+        )
+        return emit(stepped, state, progress, finite)
 
-    @functools.cache
-    def core_shapes() -> CoreState:
-        return jax.eval_shape(core.reset, jax.random.key(0))
+    def reset(key: Array) -> tuple[EnvState, TimeStep]:
+        # Through the barrier the compiler knows nothing of the state: these are the instructions of any other step,
+        # which round alike.
+        spec = core.spec.action
+        return step(*jax.lax.optimization_barrier((prepare(key), jnp.zeros(spec.shape, spec.dtype))))
 
     def prepare(key: Array) -> EnvState:
         # What stands in the core is never used: a step from a state that needs a reset starts an episode.
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), core_shapes())
-        return EnvState(nothing, key, jnp.ones((), bool), jnp.zeros((), jnp.int32))
+        # Copies, so that the state may be donated.
+        blank = core.blank() if core.blank is not None else jax.tree.map(_zeros, jax.eval_shape(core.reset, key))
+        count = lambda: jnp.zeros((), jnp.int32)
+        return EnvState(jax.tree.map(jnp.copy, blank), key, count(), jnp.ones((), bool), count(), count())
 
     pictures = core.pictures
     if pictures is not None:
         record = pictures.record
         pictures = pictures._replace(record=lambda state: record(state.core))
     return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare, pictures)
+
+
+def _zeros(x: Any) -> Array:
+    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0, impl=jax.random.key_impl(x)), x.shape)
+    return jnp.zeros(x.shape, x.dtype)
+
+
+def _check_core(core: Core) -> None:
+    """Raises ValueError where a core's functions don't fit each other or its specification."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    for name, spec in core.spec.observation.items():
+        if not (spec.dtype == jnp.uint8 and len(spec.shape) == 3) and not (
+            spec.dtype == jnp.float32 and len(spec.shape) <= 1
+        ):
+            raise ValueError(
+                f"observation {name!r}: expected an image, uint8 [height, width, channels], or a vector, float32 [] or "
+                f"[n], got {_described(spec)}"
+            )
+    state = jax.eval_shape(core.reset, key)
+    _expect_arrays("the state that reset returns", state)
+    action = jax.ShapeDtypeStruct(core.spec.action.shape, core.spec.action.dtype)
+    stepped, progress = jax.eval_shape(core.step, state, action, jax.ShapeDtypeStruct((), jnp.bool_), key)
+    expect_same("the state that step returns", state, stepped)
+    if core.blank is not None:
+        expect_same("the state that blank returns", state, jax.eval_shape(core.blank))
+    flag: Any = jax.ShapeDtypeStruct((), jnp.bool_)
+    reward: Any = jax.ShapeDtypeStruct((), jnp.float32)
+    expect_same("progress", Progress(reward, flag, flag, flag), progress)
+    obs = jax.eval_shape(core.observe, state)
+    wanted = {name: jax.ShapeDtypeStruct(spec.shape, spec.dtype) for name, spec in core.spec.observation.items()}
+    expect_same("what observe returns", wanted, obs)
+
+
+def expect_same(what: str, expected: Any, got: Any) -> None:
+    """Compares shapes and dtypes of two pytrees.
+
+    Raises:
+      ValueError: they differ; the message names ``what``, and for the first leaf that differs what was expected
+        and got.
+    """
+    leaves, others = (jax.tree_util.tree_flatten_with_path(tree)[0] for tree in (expected, got))
+    structure: Any = jax.tree.structure(expected)
+    other_structure: Any = jax.tree.structure(got)
+    if structure != other_structure:
+        raise ValueError(f"{what}: expected the structure {structure}, got {other_structure}")
+    for (path, leaf), (_, other) in zip(leaves, others, strict=True):
+        _expect(f"{what}{jax.tree_util.keystr(path)}", _described(leaf), _described(other))
+
+
+def _expect_arrays(what: str, tree: Any) -> None:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        if getattr(leaf, "weak_type", False):
+            raise ValueError(
+                f"{what}{jax.tree_util.keystr(path)}: expected an array of a dtype of its own, got a Python number, "
+                f"whose dtype later operations would change; write jnp.asarray(value, dtype)"
+            )
+
+
+def _expect(what: str, expected: str, got: str) -> None:
+    if expected != got:
+        raise ValueError(f"{what}: expected {expected}, got {got}")
+
+
+def _described(x: Any) -> str:
+    """Dtype and shape, as in float32[3]."""
+    if not (hasattr(x, "shape") and hasattr(x, "dtype")):
+        return f"{type(x).__name__} {x!r}"
+    dtype = x.dtype if jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended) else jnp.dtype(x.dtype).name
+    return f"{dtype}[{','.join(map(str, x.shape))}]"

@@ -13,7 +13,14 @@ from ne_dreamer_jax.envs.base import Env, EnvState
 from ne_dreamer_jax.types import Array, ContinuousAction, TimeStep
 
 
-def check(env: Env, key: Array, num_envs: int = 2, num_steps: int = 5) -> None:
+def check(
+    env: Env,
+    key: Array,
+    num_envs: int = 2,
+    num_steps: int = 5,
+    beginning_steps: int = 50,
+    echo: Callable[[str], None] = print,
+) -> None:
     """Runs some environments at once and checks what a learner relies on.
 
     Args:
@@ -21,6 +28,8 @@ def check(env: Env, key: Array, num_envs: int = 2, num_steps: int = 5) -> None:
       key: typed key [], for episodes and random actions.
       num_envs: how many run side by side under ``vmap``.
       num_steps: steps before a restart is forced, and after it.
+      beginning_steps: steps for which episodes that begin in different ways are compared.
+      echo: takes a line on each part of the check, before it begins.
 
     Raises:
       AssertionError: a promise is broken; the message says which.
@@ -28,11 +37,13 @@ def check(env: Env, key: Array, num_envs: int = 2, num_steps: int = 5) -> None:
     reset, step, observe = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.observe))
     reset_key, action_key = jax.random.split(key)
     keys = jax.random.split(reset_key, num_envs)
+    echo("Compiling reset and step, and resetting.")
     state, timestep = reset(keys)
     _expect_same(reset(keys), (state, timestep), "reset with the same key")
     _expect_first(timestep)
     _check_timestep(env, timestep, num_envs)
 
+    echo(f"Stepping {num_envs} environments {2 * num_steps} times, with a restart in between.")
     for number in range(2 * num_steps):
         restart = number == num_steps
         if restart:
@@ -52,11 +63,43 @@ def check(env: Env, key: Array, num_envs: int = 2, num_steps: int = 5) -> None:
         if restart:
             _expect_first(timestep)
             other = step(before, -action) if isinstance(env.spec.action, ContinuousAction) else step(before, action * 0)
-            _expect_same(other, (state, timestep), "a restart, whatever the action")
+            _expect_same(other[1], timestep, "a restart, whatever the action")
             changed = jax.random.key_data(state.key) != jax.random.key_data(before.key)
             _expect(bool(changed.any(-1).all()), "a restart moves on to a new key")
+
+    echo(f"Comparing episodes that begin by reset, by prepare and by auto-reset, for {beginning_steps} steps.")
+    _check_beginnings(env, reset, step, state, jax.random.fold_in(action_key, 2 * num_steps), beginning_steps)
     for name, function in (("reset", reset), ("step", step)):
         _expect(_compilations(function) == 1, f"{name} compiles once")
+
+
+def _check_beginnings(
+    env: Env, reset: Callable[..., Any], step: Callable[..., Any], old: EnvState, key: Array, num_steps: int
+) -> None:
+    """An episode is the same, bit for bit, however it begins.
+
+    Args:
+      old: states of N environments that have played for a while.
+    """
+    num_envs = len(old.needs_reset)
+    key, reset_key = jax.random.split(key)
+    keys = jax.random.split(reset_key, num_envs)
+    action = random_action(env, key, num_envs)
+    begun = {
+        "reset": reset(keys),
+        "prepare and step": step(jax.vmap(env.prepare)(keys), action),
+        "auto-reset": step(old._replace(key=keys, needs_reset=jnp.ones(num_envs, bool)), action),
+    }
+    for number in range(num_steps + 1):
+        state, timestep = begun["reset"]
+        for name, (other, seen) in begun.items():
+            promise = f"an episode begun by {name} as by reset, after {number} steps"
+            _expect_same(seen, timestep, promise)
+            if number:  # before the first step there may be leftovers that nothing reads
+                _expect_same(other._replace(faults=state.faults, bad_actions=state.bad_actions), state, promise)
+        if number < num_steps:
+            action = random_action(env, jax.random.fold_in(key, number), num_envs)
+            begun = {name: step(state, action) for name, (state, _) in begun.items()}
 
 
 def random_action(env: Env, key: Array, num_envs: int) -> Array:

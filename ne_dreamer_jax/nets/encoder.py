@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import flax.linen as nn
 import jax.numpy as jnp
 from flax.linen import initializers
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import symlog
 from ne_dreamer_jax.nets import conv
 from ne_dreamer_jax.nets.blocks import MLP, kernel_init
+from ne_dreamer_jax.ranges import Range, Width
 from ne_dreamer_jax.types import Array, ArraySpec
 
 
@@ -20,16 +22,21 @@ from ne_dreamer_jax.types import Array, ArraySpec
 class EncoderConfig:
     """Sizes of the encoder."""
 
-    depth: int = 16
+    depth: Width = 16
     """Channels of a stage are depth times its multiplier."""
-    multipliers: tuple[int, ...] = (2, 3, 4, 4)
+    multipliers: tuple[Width, ...] = (2, 3, 4, 4)
     """One convolution stage, which halves the sides, for each entry."""
-    kernel: int = 5
+    kernel: Annotated[int, Range(1, 1_000)] = 5
     """Side of the convolution kernels."""
-    layers: int = 3
+    layers: Annotated[int, Range(1, 1_000)] = 3
     """Layers of the multilayer perceptron for vectors."""
-    units: int = 256
+    units: Width = 256
     """Width of the multilayer perceptron for vectors, and its share of the embedding."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        if not self.multipliers:
+            raise ValueError("encoder.multipliers: expected one or more, got none.")
 
 
 def split_observation(observation: Mapping[str, ArraySpec]) -> tuple[list[str], list[str]]:

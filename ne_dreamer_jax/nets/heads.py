@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import unimix_logits
 from ne_dreamer_jax.nets.blocks import MLP, Linear
 from ne_dreamer_jax.nets.rssm import sample_onehot
+from ne_dreamer_jax.ranges import Depth, NonNegative, Positive, Range, Share, Width
 from ne_dreamer_jax.types import ActionSpec, Array, DiscreteAction
 
 
@@ -19,25 +21,30 @@ from ne_dreamer_jax.types import ActionSpec, Array, DiscreteAction
 class HeadsConfig:
     """Sizes of the heads."""
 
-    units: int = 256
+    units: Width = 256
     """Width of all heads."""
-    reward_layers: int = 1
-    continue_layers: int = 1
-    actor_layers: int = 3
-    critic_layers: int = 3
-    bins: int = 255
+    reward_layers: Depth = 1
+    continue_layers: Depth = 1
+    actor_layers: Depth = 3
+    critic_layers: Depth = 3
+    bins: Annotated[int, Range(2, 1_000_000)] = 255
     """Bins of the symexp-twohot distributions of reward and value."""
-    actor_scale: float = 0.01
+    actor_scale: NonNegative = 0.01
     """Scale of the policy's last layer at initialisation (reward and value start at zero, continue at one)."""
-    min_std: float = 0.1
+    min_std: Positive = 0.1
     """Least standard deviation of the bounded normal policy."""
-    max_std: float = 1.0
+    max_std: Positive = 1.0
     """Greatest standard deviation of the bounded normal policy."""
-    unimix: float = 0.01
+    unimix: Share = 0.01
     """Share of the uniform distribution in a discrete policy."""
     clip_actions: bool = True
     """Whether continuous actions are clipped to their bounds where they enter replay or a model (an environment clips
     them itself). The released code doesn't: its recurrence divides by max(1, |a|), its predictor sees them as drawn."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        if self.min_std > self.max_std:
+            raise ValueError(f"heads: expected min_std of at most max_std, got {self.min_std} and {self.max_std}.")
 
 
 class Head(nn.Module):

@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.nets.blocks import Linear
+from ne_dreamer_jax.ranges import Depth, Width
 from ne_dreamer_jax.types import Array
 
 
@@ -18,18 +20,19 @@ from ne_dreamer_jax.types import Array
 class PredictorConfig:
     """Sizes of the predictor."""
 
-    layers: int = 2
+    layers: Depth = 2
     """Transformer layers; 0 is the ablation without a transformer: a perceptron on each step alone."""
-    width: int = 256
-    heads: int = 4
-    feedforward: int = 1024
-    positions: int = 128
+    width: Width = 256
+    heads: Width = 4
+    feedforward: Width = 1024
+    positions: Width = 128
     """Longest sequence, in steps; a step is two tokens, each with a learned position."""
     projector: bool = True
     """A bias-free linear layer F to E before the tokens' own linear layer. Without it the function class is the
     same; what changes is the optimisation (the paper's w/o projector)."""
 
     def __post_init__(self) -> None:
+        ranges.check(self)
         if self.width % self.heads:
             raise ValueError(
                 f"objective.predictor.width must be a multiple of its heads, got {self.width} and {self.heads}; the "

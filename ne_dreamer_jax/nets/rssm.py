@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import unimix_logits
 from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init, per_block
+from ne_dreamer_jax.ranges import Depth, Share, Width
 from ne_dreamer_jax.types import Array, Latent
 
 
@@ -23,22 +25,23 @@ from ne_dreamer_jax.types import Array, Latent
 class RSSMConfig:
     """Sizes of the recurrent state-space model (defaults: the 12m preset)."""
 
-    deter: int = 2048
+    deter: Width = 2048
     """D, size of the deterministic state."""
-    stoch: int = 32
+    stoch: Width = 32
     """S, number of categorical latents."""
-    classes: int = 16
+    classes: Width = 16
     """K, classes per latent."""
-    hidden: int = 256
+    hidden: Width = 256
     """Width of the layers around the recurrence."""
-    blocks: int = 8
+    blocks: Width = 8
     """Blocks of the recurrence; each sees only its own D / blocks of the state, and all of the inputs."""
-    prior_layers: int = 2
+    prior_layers: Depth = 2
     """Hidden layers from h_t to the prior's logits."""
-    unimix: float = 0.01
+    unimix: Share = 0.01
     """Share of the uniform distribution mixed into the distribution that latents are sampled from."""
 
     def __post_init__(self) -> None:
+        ranges.check(self)
         if self.deter % self.blocks:
             raise ValueError(
                 f"rssm.deter must be a multiple of rssm.blocks, got {self.deter} and {self.blocks}; "

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import assignment_loss, sinkhorn
 from ne_dreamer_jax.nets.blocks import Linear
 from ne_dreamer_jax.objectives.augment import random_shift
 from ne_dreamer_jax.objectives.base import Model, Objective
+from ne_dreamer_jax.ranges import CountOrNone, Positive, Range, Share, Width
 from ne_dreamer_jax.types import Array, Batch, Metrics, Params, Rollout
 
 
@@ -34,28 +36,26 @@ class DreamerPro:
     et al., 2022).
     """
 
-    prototypes: int = 2500
-    dimension: int = 32
+    prototypes: Width = 2500
+    dimension: Width = 32
     """Size of prototypes and projections."""
-    temperature: float = 0.1
+    temperature: Positive = 0.1
     """Of the predictions."""
-    epsilon: float = 0.05
+    epsilon: Positive = 0.05
     """Of the assignments; see `losses.swav.sinkhorn`."""
-    iterations: int = 3
+    iterations: Annotated[int, Range(1, 10_000)] = 3
     """Of Sinkhorn's algorithm."""
-    teacher_rate: float = 0.05
+    teacher_rate: Share = 0.05
     """Share of the encoder and the projection that moves into the teacher at each update."""
-    frozen_updates: int = 10_000
+    frozen_updates: CountOrNone = 10_000
     """Updates at the start in which the prototypes stay as they are."""
-    max_shift: float = 3.0
+    max_shift: Annotated[float, Range(0.0, 1e6)] = 3.0
     """Pixels by which a view may be shifted in each direction; the same across time."""
-    warm_up: int = 1
+    warm_up: CountOrNone = 1
     """Steps at the start of a sequence that count for neither ``swav`` nor ``temporal``."""
 
     def __post_init__(self) -> None:
-        for name in ("prototypes", "dimension", "iterations", "temperature", "epsilon"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"objective.{name}: expected more than 0, got {getattr(self, name)}.")
+        ranges.check(self)
 
     @property
     def losses(self) -> Mapping[str, float]:

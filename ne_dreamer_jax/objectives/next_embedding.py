@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import cosine_alignment, next_embedding_loss, vicreg
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
+from ne_dreamer_jax.ranges import NonNegative, Positive, Range
 from ne_dreamer_jax.types import Array, DiscreteAction, Metrics, Params, Rollout
 
 ALIGNMENTS: dict[str, Any] = {"barlow_twins": None, "cosine": cosine_alignment, "vicreg": vicreg}
@@ -23,15 +25,15 @@ class NextEmbedding:
 
     predictor: PredictorConfig = field(default_factory=PredictorConfig)
     """``layers=0`` is w/o transformer, ``projector=False`` w/o projector."""
-    shift: int = 1
+    shift: Annotated[int, Range(0, 10_000)] = 1
     """The embedding at t + shift is the target of the prediction at t; 0 is w/o shift."""
-    steps: int = 1
+    steps: Annotated[int, Range(1, 10_000)] = 1
     """K: at each step the embeddings at t + shift, ..., t + shift + K - 1 are predicted, each by outputs of its own."""
-    step_discount: float = 0.5
+    step_discount: Positive = 0.5
     """The loss of each step further ahead weighs so much less; the weights are scaled to the sum 1."""
     alignment: Literal["barlow_twins", "cosine", "vicreg"] = "barlow_twins"
     """How predictions are aligned to embeddings: as in the paper, or by a loss that it names as open."""
-    redundancy: float = 5e-4
+    redundancy: NonNegative = 5e-4
     """Weight of the off-diagonal terms of Barlow Twins."""
     action: Literal["current", "previous"] = "current"
     """Whether the predictor at t is fed a_t (the paper) or a_{t-1} (the released code)."""
@@ -41,17 +43,7 @@ class NextEmbedding:
     """Whether attention reaches back beyond the start of the episode (the released code)."""
 
     def __post_init__(self) -> None:
-        if self.action not in ("current", "previous"):
-            raise ValueError(f"objective.action: expected 'current' or 'previous', got {self.action!r}.")
-        if self.shift < 0:
-            raise ValueError(f"objective.shift: expected 0 or more, got {self.shift}.")
-        if self.steps < 1 or not self.step_discount > 0:
-            raise ValueError(
-                f"objective: expected steps of 1 or more and a step_discount above 0, got {self.steps} and "
-                f"{self.step_discount}."
-            )
-        if self.alignment not in ALIGNMENTS:
-            raise ValueError(f"objective.alignment: expected one of {[*ALIGNMENTS]}, got {self.alignment!r}.")
+        ranges.check(self)
 
     @property
     def losses(self) -> Mapping[str, float]:

@@ -8,10 +8,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import image_loss, vector_loss
 from ne_dreamer_jax.nets.decoder import Decoder
 from ne_dreamer_jax.nets.rssm import initial_latent
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
+from ne_dreamer_jax.ranges import Width
 from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
 
 
@@ -25,8 +27,11 @@ class Reconstruction:
     Source: DreamerV3 (Hafner et al., 2025).
     """
 
-    blocks: int = 8
+    blocks: Width = 8
     """Blocks of the decoder's linear map from the deterministic state."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
     @property
     def losses(self) -> Mapping[str, float]:

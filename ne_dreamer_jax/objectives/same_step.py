@@ -9,9 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import barlow_twins
 from ne_dreamer_jax.nets.blocks import Linear
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
+from ne_dreamer_jax.ranges import NonNegative
 from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
 
 
@@ -26,8 +28,11 @@ class SameStep:
     Source: R2-Dreamer: Redundancy-Reduced World Models without Decoders or Augmentation (arXiv:2603.18202).
     """
 
-    redundancy: float = 5e-4
+    redundancy: NonNegative = 5e-4
     """Weight of the off-diagonal terms of Barlow Twins."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
 
     @property
     def losses(self) -> Mapping[str, float]:

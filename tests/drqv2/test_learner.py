@@ -260,8 +260,6 @@ def test_the_noise_of_updates_follows_the_agent_steps(loud):
     [
         (DrQv2Config(), EnvSpec(small.VECTOR.observation, DiscreteAction(3)), "expected continuous actions, got Disc"),
         (DrQv2Config(), EnvSpec({"image": ArraySpec((14, 20, 3), jnp.uint8)}, ContinuousAction(1)), "at least 15, got"),
-        (DrQv2Config(n_step=0), small.VECTOR, "agent.n_step: expected at least 1, got 0"),
-        (DrQv2Config(frame_stack=0), small.VECTOR, "agent.frame_stack: expected at least 1, got 0"),
     ],
 )
 def test_what_does_not_fit_is_refused(config, spec, message):

@@ -135,14 +135,15 @@ def test_a_broken_simulation_ends_its_episode_with_reward_zero_and_is_counted(en
     assert not timestep.is_terminal
     assert float(timestep.reward) == 0.0
     assert np.isfinite(timestep.obs["place"])
-    assert int(state.faults) == 1
+    of_action = np.isnan(bad_action)
+    assert (int(state.faults), int(state.bad_actions)) == ((0, 1) if of_action else (1, 0))
     state, timestep = step(state, act(1.0))
     assert timestep.is_first
     assert 10 <= float(timestep.obs["place"]) < 11
     state, timestep = step(state, act(1.0))
     assert np.isfinite(timestep.reward)
     assert not timestep.is_last
-    assert int(state.faults) == 1, "faults are counted since reset"
+    assert int(state.faults + state.bad_actions) == 1, "faults are counted since reset"
 
 
 def test_environments_of_a_batch_restart_one_by_one(env):
@@ -161,6 +162,71 @@ def test_environments_of_a_batch_restart_one_by_one(env):
             alone[index], expected = step(alone[index], act(1.0))
             for a, b in zip(jax.tree.leaves(timestep), jax.tree.leaves(expected), strict=True):
                 np.testing.assert_array_equal(a[index], b)
+
+
+def test_every_step_of_an_episode_has_a_key_of_its_own():
+    """A core that shows its key: none comes twice, over steps, episodes and environments."""
+
+    def reset(key):
+        return Walk(jax.random.uniform(key), jnp.zeros((), jnp.int32))
+
+    def step(state, action, key):
+        last = state.steps + 1 >= LIMIT
+        progress = base.Progress(jnp.zeros(()), last, jnp.zeros((), bool), jnp.ones((), bool))
+        return Walk(jax.random.uniform(key), state.steps + 1), progress
+
+    core = make_core()._replace(reset=reset, step=base.restart_or_step(reset, step, stochastic=True))
+    env = base.from_core(core)
+
+    def play(key):
+        def step(state, _):
+            state, timestep = env.step(state, act(0.0))
+            return state, timestep.obs["place"]
+
+        return jax.lax.scan(step, env.prepare(key), None, length=20 * (LIMIT + 1))[1]
+
+    shown = np.asarray(jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(0), 8)))
+    assert len(np.unique(shown)) == shown.size
+    again = np.asarray(jax.jit(jax.vmap(play))(jax.random.split(jax.random.key(0), 8)))
+    np.testing.assert_array_equal(shown, again)
+
+
+FLAG = lambda: jnp.zeros((), bool)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"observe": lambda state: {"place": jnp.zeros((3,))}},
+            r"what observe returns\['place'\]: expected float32\[\], got float32\[3\]",
+        ),
+        ({"observe": lambda state: {"spot": state.place}}, r"what observe returns: expected the structure"),
+        (
+            {"reset": lambda key: Walk(1.0, jnp.zeros((), jnp.int32))},
+            r"the state that reset returns.place: expected an array of a dtype of its own, got a Python number",
+        ),
+        (
+            {"step": lambda state, action, restart, key: (state, base.Progress(action, FLAG(), FLAG(), FLAG()))},
+            r"progress.reward: expected float32\[\], got float32\[1\]",
+        ),
+        (
+            {"step": lambda state, *_: (state.place, base.Progress(state.place, FLAG(), FLAG(), FLAG()))},
+            r"the state that step returns: expected the structure",
+        ),
+        (
+            {"blank": lambda: Walk(jnp.zeros(2), jnp.zeros((), jnp.int32))},
+            r"that blank returns.place: expected float32",
+        ),
+        (
+            {"spec": EnvSpec({"place": ArraySpec((2, 2), jnp.float32)}, ContinuousAction(1))},
+            r"observation 'place': expected an image, uint8 \[height, width, channels\], or a vector",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_each_other_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        base.from_core(make_core()._replace(**changes))
 
 
 def test_if_needed_computes_only_where_some_of_a_batch_need_it():

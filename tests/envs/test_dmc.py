@@ -252,28 +252,12 @@ def test_every_task_conforms(name):
     conformance.check(envs.make(name, obs="vector"), jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", [*QUICK, *SLOW])
-def test_a_restart_within_a_step_is_a_reset(name):
-    """The two are compiled differently; from the same key they start the same episode."""
-    ours = compiled(name)
-    state, _ = ours.reset(jax.random.split(jax.random.key(0), 4))
-    for _ in range(3):
-        state, _ = ours.step(state, jnp.ones((4, *ours.env.spec.action.shape)))
-    keys = jax.random.split(jax.random.key(1), 4)
-    state = state._replace(key=keys, needs_reset=jnp.array([True, False, True, True]))
-    state, timestep = ours.step(state, jnp.ones((4, *ours.env.spec.action.shape)))
-    expected_state, expected = ours.reset(keys)
-    for index in (0, 2, 3):
-        np.testing.assert_array_equal(
-            jax.random.key_data(state.key[index]), jax.random.key_data(expected_state.key[index])
-        )
-        for field in ("time", "qpos", "qvel", "act", "ctrl", "xpos", "sensordata"):
-            a, b = getattr(state.physics, field)[index], getattr(expected_state.physics, field)[index]
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3, err_msg=field)
-        for key, value in expected.obs.items():
-            np.testing.assert_allclose(timestep.obs[key][index], value[index], rtol=1e-3, atol=1e-3, err_msg=key)
-        assert int(state.core.steps_left[index]) == int(expected_state.core.steps_left[index])
-    assert float(state.physics.time[1]) > 0
+def test_training_begins_with_the_models_own_data():
+    """Quadruped's equality constraints, which a state of zeros would turn off."""
+    env = envs.make("dmc/quadruped_walk", obs="vector")
+    physics = env.prepare(jax.random.key(0)).physics
+    assert physics.eq_active.shape == (4,)
+    assert physics.eq_active.all()
 
 
 def test_physics_that_stops_being_finite_ends_the_episode_and_the_next_is_sound():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax.envs import conformance, dmc
-from ne_dreamer_jax.envs.dmc.simulation import integrated
+from ne_dreamer_jax.envs.dmc.simulation import STATE, start_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -113,7 +113,7 @@ def test_steps_sensors_and_restarts_are_mujocos(kind, n_sub_steps):
     rng = np.random.default_rng(0)
     qvel = 0.3 * rng.normal(size=model.nv)
     initial = simulation.initial()
-    first = integrated(initial.replace(qvel=jnp.asarray(qvel, jnp.float32)))
+    first = start_of(initial.replace(qvel=jnp.asarray(qvel, jnp.float32)))
     advance = jax.jit(simulation.advance)
     never, always = jnp.zeros((), bool), jnp.ones((), bool)
 
@@ -153,7 +153,181 @@ def own_task(model, camera=0):
 def test_a_task_of_ones_own_makes_a_conforming_environment():
     env = dmc.from_task(own_task(swinging()), obs="both", image_size=16)
     assert set(env.spec.observation) == {"image", "velocity", "tip"}
-    conformance.check(env, jax.random.key(0))
+    said = []
+    conformance.check(env, jax.random.key(0), echo=said.append)
+    assert len(said) >= 3, "what takes seconds is said before it is done"
+
+
+LINKED = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="goal" mocap="true" pos="0.3 0 0.4"><geom size="0.03" contype="0" conaffinity="0"/></body>
+    <body name="a" pos="0 0 1">
+      <joint name="a" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.4" contype="0" conaffinity="0"/>
+    </body>
+    <body name="b" pos="1 0 1">
+      <joint name="b" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.4" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <equality><joint joint1="a" joint2="b"/></equality>
+  <actuator><general joint="a" ctrlrange="-1 1" dyntype="filter" dynprm="0.05"/></actuator>
+  <size nuserdata="2"/>
+</mujoco>"""
+
+# Each field that a state consists of -> a value other than the model's own.
+SET = {
+    "time": lambda x: x + 1.5,
+    "qpos": lambda x: x + 0.3,
+    "qvel": lambda x: x + 0.2,
+    "act": lambda x: x + 0.5,
+    "qacc_warmstart": lambda x: x + 0.1,
+    "ctrl": lambda x: x + 0.4,
+    "qfrc_applied": lambda x: x + 0.2,
+    "xfrc_applied": lambda x: x + 0.1,
+    "eq_active": lambda x: ~x,
+    "mocap_pos": lambda x: x + jnp.array([[-0.5, 0.1, 0.3]]),
+    "mocap_quat": lambda x: jnp.array([[0.6, 0.8, 0.0, 0.0]]),
+    "userdata": lambda x: x + 3.0,
+}
+
+
+def linked_task(fields=(), draws=False, **changes):
+    """Two arms joined by an equality, and a body that the task moves; every field of its state is observed."""
+    simulation = dmc.Simulation.of(mujoco.MjModel.from_xml_string(LINKED), 0.02)
+    initial = simulation.initial()
+
+    def reset(key):
+        scale = jax.random.uniform(key, minval=0.5, maxval=1.5) if draws else jnp.ones(())
+        new = {name: SET[name](getattr(initial, name)) for name in fields}
+        return initial.replace(**{k: v if v.dtype == bool else v * scale for k, v in new.items()}), ()
+
+    def observe(data, _):
+        state = {name: jnp.ravel(getattr(data, name)).astype(jnp.float32) for name in STATE}
+        return {**state, "goal": data.xpos[1], "forces": data.qacc}
+
+    task = dmc.Task(simulation, 0.2, reset, lambda data, _: data.qpos[1], observe)
+    return task._replace(**changes)
+
+
+def test_whatever_a_reset_sets_holds_in_training_and_as_in_mujoco():
+    """Episodes that begin as in training and by auto-reset, each with one field of its own, beside C MuJoCo's."""
+    plain = linked_task()
+    initial = plain.simulation.initial()
+
+    def reset(key):
+        which = jax.random.randint(key, (), 0, len(STATE), jnp.int32)
+        fields = {
+            name: jnp.where(which == i, SET[name](getattr(initial, name)), getattr(initial, name))
+            for i, name in enumerate(STATE)
+        }
+        return initial.replace(**fields), which
+
+    task = plain._replace(reset=reset, episode=jnp.zeros((), jnp.int32))
+    env, num_envs, tried = dmc.from_task(task, obs="vector", action_repeat=1), 24, set()
+    step = jax.jit(jax.vmap(env.step))
+    state = jax.vmap(env.prepare)(jax.random.split(jax.random.key(0), num_envs))
+    for _ in range(2):
+        state, first = step(state, jnp.ones((num_envs, 1)))
+        assert first.is_first.all()
+        references = []
+        for i, which in enumerate(np.asarray(state.core.episode)):
+            field, data = STATE[which], mujoco.MjData(task.simulation.mj_model)
+            tried.add(field)
+            wanted = np.asarray(SET[field](getattr(initial, field)))
+            np.testing.assert_array_equal(getattr(state.physics, field)[i], wanted)
+            if field == "time":
+                data.time = wanted
+            else:
+                getattr(data, field)[:] = wanted
+            references.append(data)
+        for _ in range(10):
+            state, timestep = step(state, jnp.ones((num_envs, 1)))
+            for i, data in enumerate(references):
+                data.ctrl[:] = 1
+                mujoco.mj_step(task.simulation.mj_model, data, 2)
+                np.testing.assert_allclose(timestep.obs["qpos"][i], data.qpos, atol=1e-5, err_msg=STATE[which])
+        assert timestep.is_last.all()
+        for i, data in enumerate(references):
+            mujoco.mj_kinematics(task.simulation.mj_model, data)
+            np.testing.assert_allclose(timestep.obs["goal"][i], data.xpos[1], atol=1e-5)
+    assert tried == set(STATE)
+
+
+OWN = {
+    "all that a reset may set, drawn anew": lambda: linked_task(STATE, draws=True),
+    "forces read at the start": lambda: linked_task(draws=True, observe=lambda data, _: {"f": data.qacc}),
+    "coasting": lambda: linked_task(["qvel"], draws=True, coast=3),
+    "ends early": lambda: linked_task(["qvel"], draws=True, terminal=lambda data, _: data.time > 0.1),
+    "draws beside the state": lambda: linked_task(
+        reset=lambda key: (linked_task().simulation.initial(), {"aim": jax.random.normal(key, (2,))}),
+        episode={"aim": jnp.zeros(2)},
+        observe=lambda data, episode: {"aim": episode["aim"], "q": data.qpos},
+    ),
+    "sensors of accelerations": lambda: own_task(swinging())._replace(time_limit=0.3),
+    "contact": lambda: own_task(MODELS["contact"]())._replace(time_limit=0.3),
+}
+
+
+@pytest.mark.parametrize("kind", OWN)
+def test_episodes_of_own_tasks_are_the_same_however_they_begin(kind):
+    conformance.check(dmc.from_task(OWN[kind](), obs="vector"), jax.random.key(0))
+
+
+def test_conformance_notices_a_beginning_that_leaves_something_of_the_old_episode():
+    env = dmc.from_task(linked_task(STATE, draws=True), obs="vector")
+
+    def prepare(key):
+        state = env.prepare(key)
+        physics = state.physics.replace(qpos=state.physics.qpos + 1.0)
+        return state._replace(core=state.core._replace(physics=physics), needs_reset=jnp.zeros((), bool))
+
+    with pytest.raises(AssertionError, match="begun by prepare and step as by reset"):
+        conformance.check(env._replace(prepare=prepare), jax.random.key(0))
+
+
+def test_a_reset_may_settle_what_it_returns():
+    task = linked_task(["qpos"])
+    settling = task._replace(reset=jax.jit(lambda key: (task.simulation.settle(task.reset(key)[0]), ())))
+    dmc.from_task(settling, obs="vector")
+
+
+def test_a_task_may_end_an_episode_at_any_control_step():
+    """Above 0.11 s, which no multiple of the repeat's 0.08 s is: the step stops there, and nothing more is earned."""
+    task = linked_task(["qvel"], terminal=lambda data, _: data.time > 0.11, reward=lambda data, _: jnp.ones(()))
+    env = dmc.from_task(task, obs="vector", action_repeat=4)
+    step = jax.jit(env.step)
+    state = env.prepare(jax.random.key(0))
+    for _ in range(2):
+        seen = []
+        for _ in range(3):
+            state, timestep = step(state, jnp.ones(1))
+            seen.append((bool(timestep.is_first), bool(timestep.is_terminal), float(timestep.reward)))
+            assert bool(timestep.is_last) == bool(timestep.is_terminal)
+        assert seen == [(True, False, 0.0), (False, False, 4.0), (False, True, 2.0)]
+        assert float(state.physics.time) == pytest.approx(0.12)
+
+
+def test_python_numbers_serve_as_rewards_and_observations():
+    env = dmc.from_task(linked_task(reward=lambda *_: 2.5, observe=lambda *_: {"x": 1.0}), obs="vector")
+    state, timestep = env.step(env.prepare(jax.random.key(0)), jnp.zeros(1))
+    state, timestep = env.step(state, jnp.zeros(1))
+    assert (float(timestep.reward), float(timestep.obs["x"])) == (5.0, 1.0)
+    assert timestep.obs["x"].dtype == jnp.float32
+
+
+def test_an_action_of_another_shape_or_dtype_is_refused():
+    env = dmc.from_task(own_task(swinging()), obs="vector")
+    state = env.prepare(jax.random.key(0))
+    for action, got in (
+        (jnp.zeros(2), r"float32\[2\]"),
+        (jnp.zeros(()), r"float32\[\]"),
+        (jnp.zeros(1, int), r"int32\[1\]"),
+    ):
+        with pytest.raises(ValueError, match=r"action: expected float32\[1\], got " + got):
+            env.step(state, action)
 
 
 @pytest.mark.parametrize(
@@ -222,6 +396,29 @@ SHAPES = {
         {"observe": lambda data, _: {"image": data.qpos}},
         r"another name than 'image', which the pixels",
     ),
+    "no pair": ({"reset": lambda key: dmc.load("pendulum", "swingup").reset(key)[0]}, r"task.reset: expected a pair"),
+    "no data": ({"reset": lambda key: (key, ())}, r"task.reset: expected a pair of an mjx.Data and what the episode"),
+    "draws without an example": (
+        {"reset": lambda key: (own_task(swinging()).reset(key)[0], jax.random.normal(key))},
+        r"expected it to draw what task.episode is an example of, PyTreeDef\(\(\)\), got PyTreeDef\(\*\)",
+    ),
+    "draws of another shape": (
+        {"reset": lambda key: (own_task(swinging()).reset(key)[0], jnp.zeros(3)), "episode": jnp.zeros(2)},
+        r"what the episode draws: expected float32\[2\], got float32\[3\]",
+    ),
+    "a field of another shape": (
+        {"reset": lambda key: (own_task(swinging()).simulation.initial().replace(qvel=jnp.zeros(7)), ())},
+        r"task.reset: its mjx.Data.*qvel: expected float32\[2\], got float32\[7\]",
+    ),
+    "what follows from the state": (
+        {"reset": lambda key: (own_task(swinging()).simulation.initial().replace(xpos=jnp.ones((3, 3))), ())},
+        r"expected it to set fields among time, qpos, .*; got xpos set too",
+    ),
+    "an end that is no flag": (
+        {"terminal": lambda data, _: data.qpos[0]},
+        r"task.terminal: expected bool\[\], got float32\[\]",
+    ),
+    "no pose": ({"pose": lambda data, _: data.qpos}, r"task.pose: expected an mjx.Data"),
     "no camera of this name": ({"camera": "sde"}, r"the name of a camera or an id from 0 to 0, got 'sde'.*\['side'\]"),
     "no camera of this number": ({"camera": 1}, r"an id from 0 to 0, got 1"),
 }

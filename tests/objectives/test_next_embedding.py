@@ -166,20 +166,6 @@ def test_what_follows_from_the_action_is_learned_from_it_and_not_from_the_one_be
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"action": "next"}, "objective.action: expected 'current' or 'previous', got 'next'"),
-        ({"alignment": "l2"}, "objective.alignment: expected one of .*, got 'l2'"),
-        ({"steps": 0}, "expected steps of 1 or more and a step_discount above 0, got 0"),
-        ({"shift": -1}, "objective.shift: expected 0 or more, got -1"),
-    ],
-)
-def test_settings_out_of_range_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        replace(CONFIG, **changes)
-
-
-@pytest.mark.parametrize(
     ("changes", "length", "message"),
     [
         ({"shift": 2, "steps": 5}, 6, "objective.steps: expected at most agent.batch_length 6 .* 2, got 5"),

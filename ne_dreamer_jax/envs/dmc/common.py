@@ -22,14 +22,17 @@ class Task(NamedTuple):
     Attributes:
       simulation: the model and its stepping.
       time_limit: seconds of an episode.
-      reset: key -> the first state and the episode's draws; from ``simulation.initial()``, with another ``qpos`` and
-        ``qvel``. Nothing that depends on these needs to be current.
+      reset: key -> the first state and the episode's draws: ``simulation.initial()`` with other values of fields that a
+        state consists of (``simulation.STATE``: ``qpos``, ``qvel``, ``mocap_pos``, ``eq_active``, ...). Whatever
+        follows from these is computed anew.
       reward: (data, episode) -> float32 [], of each control step.
       observe: (data, episode) -> name -> float32 [] or [n], the observations beside pixels.
       episode: an example of what ``reset`` draws besides the state, for shapes.
       coast: control steps without action from the first state on, before the episode begins.
       camera: id or name of the camera whose pixels agents see.
       pose: (data, episode) -> data with what the episode moves, such as a target, for drawing.
+      terminal: (data, episode) -> bool [], whether the episode ends here, in a state of value zero; asked after each
+        control step, whatever the action repeat. None: episodes end by their time limit alone.
     """
 
     simulation: Simulation
@@ -41,6 +44,7 @@ class Task(NamedTuple):
     coast: int = 0
     camera: int | str = 0
     pose: Callable[[mjx.Data, Episode], mjx.Data] = lambda data, _: data
+    terminal: Callable[[mjx.Data, Episode], Array] | None = None
 
 
 def random_joints(mj_model: mujoco.MjModel, unlimited: bool = True) -> Callable[[Array], Array]:

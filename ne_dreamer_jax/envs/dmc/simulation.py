@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import importlib.util
 import io
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -28,22 +29,50 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that its optional W
     from mujoco.mjx._src import math as mjx_math
     from mujoco.mjx._src import solver as mjx_solver
 
-Integrated = dict[str, Array]
-"""The fields of ``mjx.Data`` that an integrator changes. With the controls, all others follow from them."""
+Start = dict[str, Array]
+"""Fields of ``mjx.Data`` that a state consists of; all others follow from them."""
 
+STATE = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "qacc_warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "userdata",
+)
+"""MuJoCo's mjSTATE_INTEGRATION, but for what MJX has no use for (plugins, histories of delays)."""
+
+FORCES = (
+    "qacc",
+    "qacc_smooth",
+    "act_dot",
+    "actuator_force",
+    "qfrc_actuator",
+    "qfrc_smooth",
+    "qfrc_constraint",
+    "qfrc_inverse",
+    "_impl",
+)
+"""Fields that are of the state before the last integration: what settles a state does not compute them."""
 
 LINE_SEARCH = 8
 """Turns of the solver's line search in `Simulation.fast`."""
 
 
-def integrated(data: mjx.Data) -> Integrated:
-    """Picks the integrated fields out of ``data``."""
-    return {name: getattr(data, name) for name in ("time", "qpos", "qvel", "act", "qacc_warmstart")}
+def start_of(data: mjx.Data) -> Start:
+    """The fields of ``data`` that a state consists of, `STATE`."""
+    return {name: getattr(data, name) for name in STATE}
 
 
-def substitute(data: mjx.Data, where: Array, new: Integrated) -> mjx.Data:
-    """``data``, not settled, with its integrated fields replaced if ``where``."""
-    return data.replace(**jax.tree.map(lambda a, b: jnp.where(where, a, b), new, integrated(data)))
+def substitute(data: mjx.Data, where: Array, new: Start) -> mjx.Data:
+    """``data``, not settled, with the fields of ``new`` replaced if ``where``."""
+    return data.replace(**{name: jnp.where(where, value, getattr(data, name)) for name, value in new.items()})
 
 
 def suite_directory() -> Path:
@@ -159,6 +188,8 @@ class Simulation:
             )
         mj_model = copy.copy(mj_model)
         timestep = mj_model.opt.timestep
+        if control_timestep is not None and not 0 < control_timestep < math.inf:
+            raise ValueError(f"expected control_timestep in seconds, more than 0 and finite, got {control_timestep}")
         n_sub_steps = 1 if control_timestep is None else round(control_timestep / timestep)
         if n_sub_steps < 1 or abs(n_sub_steps * timestep - (control_timestep or timestep)) > 1e-9:
             raise ValueError(f"expected control_timestep to be a multiple of {timestep:g} s, got {control_timestep}")
@@ -187,12 +218,15 @@ class Simulation:
         return self.n_sub_steps * self.mj_model.opt.timestep
 
     def initial(self) -> mjx.Data:
-        """The model's default state, at rest and settled."""
+        """The model's default state, at rest, settled and with its forces."""
         data = mujoco.MjData(self.mj_model)
-        mujoco.mj_step1(self.mj_model, data)
-        # What no stage has computed yet is uninitialised memory, and may hold what no float32 can.
-        with np.errstate(over="ignore", invalid="ignore"):
-            return mjx.put_data(self.mj_model, data)
+        mujoco.mj_forward(self.mj_model, data)
+        data.qacc_warmstart[:] = 0
+        # What no stage computes is uninitialised memory, and may hold what no float32 can.
+        # These are constants, also where a task asks for them while it is traced.
+        with np.errstate(over="ignore", invalid="ignore"), jax.ensure_compile_time_eval():
+            placed = mjx.put_data(self.mj_model, data)
+            return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), placed)  # not bound to the device it was put on
 
     def in_contact(self, data: mjx.Data) -> Array:
         """Whether any two geoms touch at the given positions; ``data`` need not be settled."""
@@ -205,23 +239,21 @@ class Simulation:
         with _mjx_numerics():
             return mjx.fwd_velocity(self.model, mjx.fwd_position(self.model, data))
 
-    def begin(self, data: mjx.Data) -> mjx.Data:
-        """Settles, and reads all sensors without any actuation, as dm_control does at the start of an episode."""
-        data = self.settle(data)
-        if self._senses_acceleration:
-            data = self._accelerate(data, passive=jnp.ones((), bool))
-        return self._sense(data)
+    def advance(
+        self, data: mjx.Data, control: Array, restart: Array, start: Start, fresh_forces: bool = False
+    ) -> mjx.Data:
+        """One control step or, where ``restart``, the state that an episode starts in.
 
-    def advance(self, data: mjx.Data, control: Array, restart: Array, start: Integrated) -> mjx.Data:
-        """One control step or, where ``restart``, what ``begin`` makes of ``start``.
-
-        Holding ``start`` in place of what the integrator returns makes one piece of compiled code serve both.
+        That is ``start``, settled, with all sensors read without any actuation, as in dm_control. Holding it in place
+        of what the integrator returns makes one piece of compiled code serve both.
 
         Args:
           data: settled, as is what is returned.
-          control: float32 [nu], in the actuators' units; zero where ``restart``.
+          control: float32 [nu], in the actuators' units; without meaning where ``restart``.
           restart: bool [].
-          start: of the new episode.
+          start: of the new episode; fields that it leaves out stay as they are in ``data``.
+          fresh_forces: whether the fields `FORCES` of a new episode, too, are its own: without actuation. Else, unless
+            sensors need them, they may be the old episode's until the next step.
         """
 
         def move(data: mjx.Data) -> mjx.Data:
@@ -248,8 +280,8 @@ class Simulation:
         plain = self.mj_model.nq == self.mj_model.nv and not self.mj_model.na and not self._senses_acceleration
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         sub_steps: Any = self.n_sub_steps
-        if self._senses_acceleration and sub_steps == 1:
-            sub_steps = jnp.where(restart, 2, 1)  # the second one reads the sensors in the new state
+        if (self._senses_acceleration or fresh_forces) and sub_steps == 1:
+            sub_steps = jnp.where(restart, 2, 1)  # the second one computes the forces in the new state
         sub_step = runge_kutta if rk4 and plain else step
         return self._sense(jax.lax.fori_loop(0, sub_steps, sub_step, data.replace(ctrl=control)))
 
