@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, ContinuousAction, EnvSpec, TimeStep
 
 CoreState = Any  # a pytree of arrays, without weak types
@@ -158,6 +159,7 @@ def from_core(core: Core) -> Env:
 
     pictures = core.pictures
     if pictures is not None:
-        record = pictures.record
-        pictures = pictures._replace(record=lambda state: record(state.core))
-    return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare, pictures)
+        record, redraw = pictures.record, pictures.redraw
+        pictures = Pictures(in_32_bits(lambda state: record(state.core)), in_32_bits(redraw))
+    observe = lambda state: core.observe(state.core)
+    return Env(core.spec, *map(in_32_bits, (reset, step, observe, prepare)), pictures)

@@ -13,6 +13,7 @@ from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.envs.dmc import environment
 from ne_dreamer_jax.envs.dmc.common import Task
 from ne_dreamer_jax.envs.dmc.simulation import Simulation
+from ne_dreamer_jax.numerics import in_32_bits
 
 __all__ = ["Simulation", "Task", "from_task", "load", "make"]
 
@@ -24,6 +25,7 @@ def load(domain: str, task: str) -> Task:
     return importlib.import_module(f"ne_dreamer_jax.envs.dmc.{domain}").load(task)
 
 
+@in_32_bits
 def make(domain: str, task: str, **options: Any) -> base.Env:
     """Makes a Control Suite environment; options and errors as of ``from_task``.
 
@@ -34,6 +36,7 @@ def make(domain: str, task: str, **options: Any) -> base.Env:
     return from_task(load(domain, task), **options)
 
 
+@in_32_bits
 def from_task(
     task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64, fast: bool = False
 ) -> base.Env:
