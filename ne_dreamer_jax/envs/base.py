@@ -161,5 +161,11 @@ def from_core(core: Core) -> Env:
     if pictures is not None:
         record, redraw = pictures.record, pictures.redraw
         pictures = Pictures(in_32_bits(lambda state: record(state.core)), in_32_bits(redraw))
-    observe = lambda state: core.observe(state.core)
-    return Env(core.spec, *map(in_32_bits, (reset, step, observe, prepare)), pictures)
+    return Env(
+        core.spec,
+        in_32_bits(reset),
+        in_32_bits(step),
+        in_32_bits(lambda state: core.observe(state.core)),
+        in_32_bits(prepare),
+        pictures,
+    )
