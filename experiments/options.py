@@ -45,6 +45,8 @@ class UserPath(click.Path):
         if text.startswith("~"):
             name = text.split("/")[0]
             self.fail(f"there is no home directory {name!r}; a folder of that name is './{name}'", param, ctx)
+        if text != text.encode("utf-8", "replace").decode():  # the libraries that store checkpoints take no other
+            self.fail(f"expected a path in UTF-8, got {os.fsencode(text)!r}", param, ctx)
         if not text or text != text.strip() or any(ord(letter) < 32 for letter in text):
             self.fail(f"expected a path without line breaks, and without blanks at its ends, got {text!r}", param, ctx)
         return super().convert(text, param, ctx)

@@ -13,7 +13,7 @@ import pytest
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax import replay
-from ne_dreamer_jax.envs import probes
+from ne_dreamer_jax.envs import dmc, probes
 from tests import tiny
 from tests.drqv2 import small
 from tests.experiments import toy
@@ -114,6 +114,13 @@ def test_64_bit_mode_changes_no_type_of_a_control_task():
     expected = stepped()
     with jax.enable_x64(True):
         assert stepped() == expected
+
+
+def test_a_task_made_in_64_bit_mode_makes_no_environment():
+    with jax.enable_x64(True):
+        task = dmc.load("pendulum", "swingup")
+        with pytest.raises(ValueError, match="expected a task of 32 bits"):
+            dmc.from_task(task, obs="vector")
 
 
 CHUNK = """

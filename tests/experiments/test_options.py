@@ -33,7 +33,7 @@ def test_home_is_a_directory_wherever_it_is_written(monkeypatch):
     assert repr(Path.home() / "run") in taken("~/run").output
 
 
-@pytest.mark.parametrize("text", ["", " run", "run ", "run\n", "a\nb", "~nobody-of-this-name/run"])
+@pytest.mark.parametrize("text", ["", " run", "run ", "run\n", "a\nb", "~nobody-of-this-name/run", "r\udcff"])
 def test_what_is_hardly_meant_as_a_path_is_refused(text):
     result = taken(text)
     assert result.exit_code == 2
