@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks import dmc_equality as equality
 from benchmarks.dmc_equality import Arrays
+from experiments.options import UserPath
 from ne_dreamer_jax.envs.dmc.common import Episode
 
 TASKS = (
@@ -83,7 +84,7 @@ def flat(name: str, segments: Segments) -> Arrays:
 
 
 @click.command(help=__doc__, context_settings={"show_default": True})
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The file to write.")
+@click.option("--out", type=UserPath(), required=True, help="The file to write.")
 def main(out: Path) -> None:
     """Writes the file."""
     arrays: Arrays = {}

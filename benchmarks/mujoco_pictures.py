@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
+from experiments.options import UserPath
+
 SIZE = 64
 TASKS = {
     "acrobot": "swingup",
@@ -158,7 +160,7 @@ def _set_state(model: Any, data: Any, arrays: dict[str, np.ndarray], i: int) -> 
 
 @click.command(help=__doc__, context_settings={"max_content_width": 110})
 @click.option("--states", type=click.IntRange(1), default=64, show_default=True, help="States of each domain.")
-@click.option("--out", type=click.Path(path_type=pathlib.Path), help="Where to store them.")
+@click.option("--out", type=UserPath(), help="Where to store them.")
 @click.option("--domain", "domains", multiple=True, type=click.Choice(sorted(TASKS)), help="Default: all ten.")
 @click.option("--serve", "stored", type=click.Path(exists=True, path_type=pathlib.Path), hidden=True)
 def main(states: int, out: pathlib.Path | None, domains: tuple[str, ...], stored: pathlib.Path | None) -> None:

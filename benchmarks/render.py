@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from benchmarks import mujoco_pictures
-from experiments.options import quiet
+from experiments.options import UserPath, quiet
 
 _STORED = pathlib.Path(__file__).parents[1] / "tests" / "render" / "references.npz"
 
@@ -33,7 +33,7 @@ _STORED = pathlib.Path(__file__).parents[1] / "tests" / "render" / "references.n
     "--states states. Needs libosmesa6.",
 )
 @click.option("--states", type=click.IntRange(1), default=64, show_default=True, help="Compared with --osmesa.")
-@click.option("--pictures", type=click.Path(file_okay=False, path_type=pathlib.Path), help="Store a picture of each.")
+@click.option("--pictures", type=UserPath(file_okay=False), help="Store a picture of each.")
 def main(
     domains: tuple[str, ...],
     frames: int,

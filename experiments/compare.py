@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from experiments.options import Name, quiet, refusing
+from experiments.options import Name, UserPath, as_argument, quiet, refusing, say
 from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names, run_directory
 
@@ -41,7 +41,7 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
     """The command that compares these methods, unless told others."""
 
     @click.command(context_settings={"max_content_width": 110}, help=help_text)
-    @click.argument("directory", type=click.Path(path_type=Path, file_okay=False))
+    @click.argument("directory", type=UserPath(file_okay=False))
     @click.option("--task", type=Name("task", envs.names()), help="What to learn; default: the preset's.")
     @click.option(
         "--method",
@@ -76,19 +76,19 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
                 for method in chosen or methods:
                     path = directory / method.replace("/", "-") / f"seed{seed}"
                     if not finished(path):
-                        click.echo(f"\n{method}, seed {seed}: {path}")
+                        say(f"\n{method}, seed {seed}: {path}")
                         train(path, [*options, "--method", method, "--seed", str(seed)])
         with refusing(run_directory.RefusedError, ValueError):
             found = find(directory)
             for line in draw(found, directory / "comparison.png"):
-                click.echo(line)
+                say(line)
 
     return main
 
 
 def train(path: Path, options: Sequence[str]) -> None:
     """One run, in a process of its own; ends this one where it fails or is stopped."""
-    arguments = [sys.executable, "-m", "experiments.train", *options, "--logdir", str(path)]
+    arguments = [sys.executable, "-m", "experiments.train", *options, "--logdir", as_argument(path)]
     code = subprocess.run(arguments, check=False).returncode
     if code:
         raise SystemExit(code)
@@ -136,7 +136,7 @@ def draw(found: Sequence[Found], path: Path) -> list[str]:
     """Draws the figure; returns a table, one line a method: mean and range over seeds of the last evaluation."""
     import numpy as np
 
-    from experiments import plots
+    from experiments import pictures, plots
 
     by_method: dict[str, list[Found]] = {}
     for run in found:
@@ -144,13 +144,15 @@ def draw(found: Sequence[Found], path: Path) -> list[str]:
     of_random = [run.random_return for run in found if run.random_return is not None]
     random_return = float(np.mean(of_random)) if of_random else None
     task = found[0].config.env.task
-    plots.comparison(
-        {method: [run.curve for run in runs] for method, runs in by_method.items()},
+    curves = {method: [run.curve for run in runs] for method, runs in by_method.items()}
+    env_steps, others = max(run.config.loop.env_steps for run in found), published(task)
+    failed: list[str] = []
+    pictures.attempt(
+        lambda: plots.comparison(
+            curves, path, title=task, env_steps=env_steps, random_return=random_return, published=others
+        ),
         path,
-        title=task,
-        env_steps=max(run.config.loop.env_steps for run in found),
-        random_return=random_return,
-        published=published(task),
+        failed.append,
     )
     lines = [f"{task}: return of the last evaluation, mean over seeds (lowest to highest)"]
     for method, runs in by_method.items():
@@ -161,7 +163,7 @@ def draw(found: Sequence[Found], path: Path) -> list[str]:
         lines.append(f"  {method:28} {np.mean(last):8.1f} ({min(last):.1f} to {max(last):.1f}), {seeds}")
     if random_return is not None:
         lines.append(f"  {'random policy':28} {random_return:8.1f}")
-    return [*lines, f"  {path}"]
+    return [*lines, *(failed or [f"  {path}"])]
 
 
 def published(task: str) -> Mapping[str, Curve]:

@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 import click
 
-from experiments.options import quiet, refusing
+from experiments.options import UserPath, find_devices, quiet, refusing, say
 from experiments.pages import use_large_pages
 from ne_dreamer_jax import run_directory, settings
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.argument("logdir", type=click.Path(path_type=Path), metavar="DIRECTORY")
+@click.argument("logdir", type=UserPath(), metavar="DIRECTORY")
 @click.option("--episodes", type=click.IntRange(1), default=10, show_default=True, help="Episodes, played together.")
 @click.option(
     "--checkpoint",
@@ -62,13 +62,14 @@ def main(
     import jax
     import numpy as np
 
-    from experiments import training, video
+    from experiments import pictures, training, video
     from ne_dreamer_jax import checkpoint, compile_cache
     from ne_dreamer_jax.config import Config
 
     compile_cache.enable()
     files = run_directory.RunDirectory(logdir)
     with refusing(run_directory.RefusedError, ValueError):
+        find_devices()
         config = run_directory.read_config(logdir, Config)
         if backend == "dm_control" and not config.env.task.startswith("dmc/"):
             raise ValueError(f"--backend dm_control: expected a run of a dmc task, got one of {config.env.task}")
@@ -78,9 +79,9 @@ def main(
     with refusing(FileNotFoundError, checkpoint.DamagedError, ValueError):
         restored = checkpoint.restore(files.checkpoints, {"agent": run.shapes.train}, prefer=prefer)
     for reason in restored.skipped:
-        click.echo(f"Passed over a damaged checkpoint: {reason}")
+        say(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
-    click.echo(f"{config.env.task}, {config.method}, after {env_step:,} environment steps ({restored.checkpoint.path})")
+    say(f"{config.env.task}, {config.method}, after {env_step:,} environment steps ({restored.checkpoint.path})")
 
     params = restored.items["agent"].params
     policy_key, random_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), EVALUATION))
@@ -103,13 +104,16 @@ def main(
                 "lengths": [int(value) for value in evaluation.lengths],
             }
             where = f" in {place}" if len(evaluate) > 1 else ""
-            click.echo(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
+            say(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
             if place == "mjx" and name == "policy" and with_video:
                 if evaluation.frames is None:
-                    click.echo("no video: this agent sees vectors, not pixels")
+                    say("no video: this agent sees vectors, not pixels")
                 else:
-                    video.write(evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND)
-                    click.echo(f"{files.video} shows the first episode")
+                    write = functools.partial(
+                        video.write, evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND
+                    )
+                    if pictures.attempt(write, files.video, say):
+                        say(f"{files.video} shows the first episode")
         content |= results if place == "mjx" else {place: results}
     run_directory.write_evaluation(files, content)
 

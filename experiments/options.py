@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
+import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import click
 
@@ -29,6 +33,50 @@ class Name(click.ParamType):
         return self.name.upper()
 
 
+class UserPath(click.Path):
+    """A path as people write it: ``~`` is the home directory, also where the shell leaves it (``--logdir=~/run``)."""
+
+    def __init__(self, file_okay: bool = True) -> None:
+        super().__init__(path_type=Path, file_okay=file_okay)
+
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; what is most likely no name at all is refused."""
+        text = os.path.expanduser(value)
+        if text.startswith("~"):
+            name = text.split("/")[0]
+            self.fail(f"there is no home directory {name!r}; a folder of that name is './{name}'", param, ctx)
+        if text != text.encode("utf-8", "replace").decode():  # the libraries that store checkpoints take no other
+            self.fail(f"expected a path in UTF-8, got {os.fsencode(text)!r}", param, ctx)
+        if not text or text != text.strip() or any(ord(letter) < 32 for letter in text):
+            self.fail(f"expected a path without line breaks, and without blanks at its ends, got {text!r}", param, ctx)
+        return super().convert(text, param, ctx)
+
+
+def as_argument(path: Path) -> str:
+    """The path as `UserPath`, in another command, takes it for the same; ``-x`` and ``~`` may be names of folders."""
+    text = str(path)
+    return f"./{text}" if text.startswith(("-", "~")) else text
+
+
+def typed(path: Path) -> str:
+    """The path as it is typed in a shell."""
+    return shlex.quote(as_argument(path))
+
+
+def say(line: str) -> None:
+    """Prints a line, as far as there is somebody to read it.
+
+    Where the reader has gone (``| head``, a terminal that was closed, a full disk), this and all later lines are lost,
+    and the program goes on. Characters that the terminal's encoding lacks become question marks.
+    """
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    try:
+        click.echo(line.encode(encoding, "replace").decode(encoding))
+    except OSError:
+        with open(os.devnull, "wb") as silence:
+            os.dup2(silence.fileno(), sys.stdout.fileno())  # what stands in buffers goes there, too
+
+
 @contextlib.contextmanager
 def refusing(*errors: type[Exception]) -> Iterator[None]:
     """Turns these errors, whose messages say what to do, into the end of the command with exit code 2."""
@@ -36,6 +84,22 @@ def refusing(*errors: type[Exception]) -> Iterator[None]:
         yield
     except errors as error:
         raise click.UsageError(str(error)) from error
+
+
+def find_devices() -> None:
+    """Starts what JAX computes with.
+
+    Raises:
+      ValueError: there is none, such as for a name in ``JAX_PLATFORMS`` that no platform has.
+    """
+    import jax
+
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        asked = os.environ.get("JAX_PLATFORMS")
+        hint = "" if asked is None else f" JAX_PLATFORMS is {asked!r}; 'cpu' is always there, or unset it."
+        raise ValueError(f"JAX has nothing to compute with: {' '.join(str(error).split())}.{hint}") from error
 
 
 def quiet() -> None:

@@ -1,20 +1,26 @@
-"""Pictures of a run, drawn without a display."""
+"""Pictures of a run, drawn without a display.
+
+Nothing here, and so nothing that trains, imports matplotlib before it draws, and then without ``MPLBACKEND``: a
+notebook hands its own backend down to all that it starts, and matplotlib refuses to be imported where that one is not
+installed. Neither pyplot nor a backend of the user's has a part in these pictures, nor has a matplotlibrc.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from ne_dreamer_jax import metrics
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TRAIN, EVALUATION, RANDOM = "#0072b2", "#d55e00", "#666666"  # of the Okabe-Ito palette: apart for every eye
 METHODS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8b5a2b", "#999999", "#000000")
@@ -36,21 +42,19 @@ def learning_curve(
       env_steps: the run's whole budget, which is the width of the picture.
       random_return: mean and standard deviation of a random policy's returns.
     """
-    figure = Figure(figsize=(7.2, 4.2), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    _train(axes, *metrics.series(lines, "train/return"))
-    _evaluation(axes, lines)
-    if random_return is not None:
-        mean, deviation = random_return
-        axes.axhspan(mean - deviation, mean + deviation, color=RANDOM, alpha=0.12, lw=0)
-        axes.axhline(mean, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({mean:.3g})")
-    axes.set(title=title, xlabel="environment steps", ylabel="return of an episode", xlim=(0, env_steps))
-    _style(axes)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(frameon=False, loc="best")
-    else:
-        axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=RANDOM)
-    _save(figure, path)
+    with _picture(path, 7.2, 4.2) as axes:
+        _train(axes, *metrics.series(lines, "train/return"))
+        _evaluation(axes, lines)
+        if random_return is not None:
+            mean, deviation = random_return
+            axes.axhspan(mean - deviation, mean + deviation, color=RANDOM, alpha=0.12, lw=0)
+            axes.axhline(mean, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({mean:.3g})")
+        axes.set(title=title, xlabel="environment steps", ylabel="return of an episode", xlim=(0, env_steps))
+        _style(axes)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, loc="best")
+        else:
+            axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=RANDOM)
 
 
 def comparison(
@@ -72,27 +76,25 @@ def comparison(
       published: label -> (environment steps, returns). What lies within the budget is drawn as a curve; if fewer than
         two points do, the first point beyond it is drawn as a level.
     """
-    figure = Figure(figsize=(7.8, 4.6), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    for color, (method, seeds) in zip(itertools.cycle(METHODS), curves.items(), strict=False):
-        for steps, returns in seeds:
-            axes.plot(steps, returns, color=color, lw=0.7, alpha=0.5)
-        label = f"{method} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
-        axes.plot(*mean_over_seeds(seeds), color=color, lw=2, marker="o", ms=3.5, label=label)
-    for style, (label, (steps, returns)) in zip(itertools.cycle((":", "-.")), published.items(), strict=False):
-        within = steps <= env_steps
-        if within.sum() > 1:
-            axes.plot(steps[within], returns[within], color="k", lw=1.2, ls=style, label=f"{label}, published")
-        else:
-            nearest = min(int(within.sum()), len(steps) - 1)
-            told = f"{label}, published, {steps[nearest]:,.0f} steps ({returns[nearest]:.3g})"
-            axes.axhline(returns[nearest], color="k", lw=1.2, ls=style, label=told)
-    if random_return is not None:
-        axes.axhline(random_return, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({random_return:.3g})")
-    axes.set(title=title, xlabel="environment steps", ylabel="evaluation return", xlim=(0, env_steps))
-    _style(axes)
-    axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _save(figure, path)
+    with _picture(path, 7.8, 4.6) as axes:
+        for color, (method, seeds) in zip(itertools.cycle(METHODS), curves.items(), strict=False):
+            for steps, returns in seeds:
+                axes.plot(steps, returns, color=color, lw=0.7, alpha=0.5)
+            label = f"{method} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
+            axes.plot(*mean_over_seeds(seeds), color=color, lw=2, marker="o", ms=3.5, label=label)
+        for style, (label, (steps, returns)) in zip(itertools.cycle((":", "-.")), published.items(), strict=False):
+            within = steps <= env_steps
+            if within.sum() > 1:
+                axes.plot(steps[within], returns[within], color="k", lw=1.2, ls=style, label=f"{label}, published")
+            else:
+                nearest = min(int(within.sum()), len(steps) - 1)
+                told = f"{label}, published, {steps[nearest]:,.0f} steps ({returns[nearest]:.3g})"
+                axes.axhline(returns[nearest], color="k", lw=1.2, ls=style, label=told)
+        if random_return is not None:
+            axes.axhline(random_return, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({random_return:.3g})")
+        axes.set(title=title, xlabel="environment steps", ylabel="evaluation return", xlim=(0, env_steps))
+        _style(axes)
+        axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def mean_over_seeds(seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -104,15 +106,34 @@ def mean_over_seeds(seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.
 
 
 def _style(axes: Axes) -> None:
+    from matplotlib.ticker import EngFormatter
+
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.25, lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _save(figure: Figure, path: Path) -> None:
+@contextlib.contextmanager
+def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
+    """Axes to draw on; at the end of the block the PNG is replaced whole. Sides are in inches of 150 pixels."""
+    backend = os.environ.pop("MPLBACKEND", None)
+    try:
+        import matplotlib.style
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    finally:
+        if backend is not None:
+            os.environ["MPLBACKEND"] = backend
     beside = path.with_name(path.name + ".partial")
-    figure.savefig(beside, format="png")
-    os.replace(beside, path)
+    with matplotlib.style.context("default"):
+        figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        yield figure.subplots()
+        try:
+            canvas.print_figure(beside, format="png")
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
 
 
 def _train(axes: Axes, steps: np.ndarray, returns: np.ndarray) -> None:

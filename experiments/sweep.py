@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from experiments.options import Name
+from experiments.options import Name, UserPath, as_argument, say
 from ne_dreamer_jax import envs, names
 
 POLL = 2.0  # seconds between two looks at the jobs
@@ -71,9 +71,7 @@ class Job:
 @click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
 @click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As of experiments.train.")
-@click.option(
-    "--logdir", type=click.Path(path_type=Path), metavar="DIRECTORY", required=True, help="Runs are kept below."
-)
+@click.option("--logdir", type=UserPath(), metavar="DIRECTORY", required=True, help="Runs are kept below.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Runs at a time.")
 @click.option("--slurm", is_flag=True, help="Submit SLURM jobs, instead of processes of this machine.")
 @click.option("--partition", help="With --slurm: the partition.")
@@ -109,7 +107,7 @@ def main(
     runs = plan(tasks, methods, range(seeds), preset, size, assignments, logdir)
     if dry_run:
         for run in runs:
-            click.echo(shlex.join(run.command))
+            say(shlex.join(run.command))
         return
     try:
         import submitit
@@ -119,8 +117,8 @@ def main(
     executor.update_parameters(timeout_min=60 * hours, name="ne_dreamer")
     if slurm:
         executor.update_parameters(gpus_per_node=gpus, **({"slurm_partition": partition} if partition else {}))
-    failed = launch(runs, executor, jobs, click.echo)
-    click.echo(f"{len(runs) - len(failed)} of {len(runs)} runs finished; their directories are in {logdir}.")
+    failed = launch(runs, executor, jobs, say)
+    say(f"{len(runs) - len(failed)} of {len(runs)} runs finished; their directories are in {logdir}.")
     raise SystemExit(1 if failed else 0)
 
 
@@ -139,7 +137,7 @@ def plan(
     runs = []
     for seed, task, method in itertools.product(seeds, dict.fromkeys(tasks), dict.fromkeys(methods)):
         folder = logdir / task.replace("/", "_") / method.replace("/", "_") / f"seed{seed}"
-        own = ["--task", task, "--method", method, "--seed", str(seed), "--logdir", str(folder)]
+        own = ["--task", task, "--method", method, "--seed", str(seed), "--logdir", as_argument(folder)]
         command = (sys.executable, "-m", "experiments.train", *shared, *own)
         runs.append(Run(f"{task} {method} seed {seed}", folder, command))
     return runs

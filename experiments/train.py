@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from experiments.options import Name, quiet, refusing
+from experiments.options import Name, UserPath, find_devices, quiet, refusing, say
 from experiments.pages import use_large_pages
 from ne_dreamer_jax import envs, names, run_directory, settings
 
@@ -64,7 +64,7 @@ FLAGS = {  # option -> the setting that it changes
 )
 @click.option(
     "--logdir",
-    type=click.Path(path_type=Path),
+    type=UserPath(),
     metavar="DIRECTORY",
     help="Where the run is kept. The same command on the same directory goes on with it.",
 )
@@ -139,16 +139,17 @@ def main(
         config = configure(preset, size, method, {FLAGS[name]: value for name, value in flags.items()}, assignments)
     if show or logdir is None:
         for path, value in settings.paths(config).items():
-            click.echo(f"{path}={settings.as_text(value)}")
+            say(f"{path}={settings.as_text(value)}")
         return
     from experiments import progress, training
     from ne_dreamer_jax import checkpoint, compile_cache, parallel
 
-    echo = click.echo if process == 0 else lambda line: None
+    echo = say if process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
         run_directory.check_same(logdir, config)
         if coordinator is not None:
             parallel.connect(coordinator, processes, process)
+        find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
         run = training.build(config, mesh=mesh)

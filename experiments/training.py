@@ -19,7 +19,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 import ne_dreamer_jax as nedreamer
-from experiments import plots, progress, video
+from experiments import pictures, plots, progress, video
+from experiments.options import typed
 from experiments.record import Record, Saves, whole
 from experiments.schedule import Schedule
 from experiments.stop import Stop
@@ -106,7 +107,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
                 if first:
-                    draw(run, files, record)
+                    draw(run, files, record, echo)
                 if step < schedule.total:  # at the end everything is saved below
                     saves.if_best(state, counters, record.score(counters))
             (stopped_by,) = parallel.agreed(stop.signal or 0)
@@ -135,8 +136,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     if "image" in run.agent.spec.observation and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
-        video.write(frames, files.video, fps=FRAMES_PER_SECOND)
-    draw(run, files, record)
+        pictures.attempt(lambda: video.write(frames, files.video, fps=FRAMES_PER_SECOND), files.video, echo)
+    draw(run, files, record, echo)
     for line in _conclusion(run, files, record):
         echo(line)
     return 0
@@ -171,13 +172,18 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
     return values, evaluation.frames
 
 
-def draw(run: Run, files: RunDirectory, record: Record) -> None:
-    """Draws the learning curve so far."""
+def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
+    """Draws the learning curve so far, if that can be."""
     config = run.config
     parameters = sum(parameter_counts(run.shapes.train.params).values())
     title = f"{config.env.task}, {config.method}, {parameters / 1e6:.1f}M parameters, seed {config.seed}"
-    plots.learning_curve(
-        record.lines, files.curve, title=title, env_steps=config.loop.env_steps, random_return=record.random_return
+    steps, random_return = config.loop.env_steps, record.random_return
+    pictures.attempt(
+        lambda: plots.learning_curve(
+            record.lines, files.curve, title=title, env_steps=steps, random_return=random_return
+        ),
+        files.curve,
+        echo,
     )
 
 
@@ -267,8 +273,9 @@ def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
             f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "
             f"{record.random_return[0]:.1f} ± {record.random_return[1]:.1f}."
         )
-    lines.append(f"  {files.curve}: the learning curve")
+    if files.curve.exists():
+        lines.append(f"  {files.curve}: the learning curve")
     if files.video.exists():
         lines.append(f"  {files.video}: an episode of the policy")
-    lines.append(f"  python -m experiments.evaluate {files.path}: more episodes")
+    lines.append(f"  python -m experiments.evaluate {typed(files.path)}: more episodes")
     return lines

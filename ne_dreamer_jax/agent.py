@@ -18,6 +18,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.ranges import NonNegative, Range
@@ -101,6 +102,7 @@ class Agent(NamedTuple):
     measures; 0 where that is little."""
 
 
+@in_32_bits
 def make_agent(config: AgentConfig | DrQv2Config, spec: EnvSpec) -> Agent:
     """The agent of ``config`` for environments of ``spec``: what kind is said by the config's type.
 
@@ -111,6 +113,7 @@ def make_agent(config: AgentConfig | DrQv2Config, spec: EnvSpec) -> Agent:
     return make_world_model_agent(config, spec)
 
 
+@in_32_bits
 def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     """The world-model agent of ``config`` for environments of ``spec``.
 
@@ -194,10 +197,10 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         return new, jax.lax.stop_gradient(latent), metrics
 
     return Agent(
-        init=jax.jit(init),
-        init_policy=init_policy,
-        act=jax.jit(act, static_argnames="mode"),
-        train_step=jax.jit(train_step, donate_argnums=0),
+        init=jax.jit(in_32_bits(init)),
+        init_policy=in_32_bits(init_policy),
+        act=jax.jit(in_32_bits(act), static_argnames="mode"),
+        train_step=jax.jit(in_32_bits(train_step), donate_argnums=0),
         config=config,
         spec=spec,
         working_bytes=lambda params: _working_bytes(config, nets.feature, params),

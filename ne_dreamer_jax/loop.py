@@ -23,6 +23,7 @@ from jax.sharding import Mesh
 from ne_dreamer_jax import host_frames, memory, parallel, ranges
 from ne_dreamer_jax import replay as replay_lib
 from ne_dreamer_jax.host_frames import HostFrames
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.ranges import Count, CountOrNone, Range
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, Metrics, PolicyState, TimeStep, TrainState, Transition
 
@@ -128,6 +129,7 @@ class Loop(NamedTuple):
     """Where ``loop.storage=host`` keeps images; to be saved and loaded with the state."""
 
 
+@in_32_bits
 def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mesh | None = None) -> Loop:
     """The training loop of an agent in an environment.
 
@@ -149,11 +151,10 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         raise ValueError(f"loop.replay_ratio: expected 0 (never learn) or at least 0.001, got {config.replay_ratio}")
     price = b * length * ratio.denominator  # of one update, in units of credit
     wage = n * ratio.numerator  # of one vector step
-    if price + wage >= 2**31 or vector_steps >= 2**31:
+    if price + wage >= 2**31:
         raise ValueError(
-            "expected a budget that can be counted in 32 bits, got "
-            f"loop.env_steps {config.env_steps:,} in {n:,} environments at loop.replay_ratio {config.replay_ratio:g}; "
-            "take more environments, or a ratio of a smaller denominator"
+            "expected updates that can be counted in 32 bits, got a loop.replay_ratio of "
+            f"{config.replay_ratio:g} for {n:,} environments and batches of {b} x {length}; take a rounder ratio"
         )
     prefill = max(-(-config.prefill // n), length + 1)
     updates = max(0, vector_steps - prefill) * wage // price
@@ -341,11 +342,12 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         state, sums, episode_sums = jax.lax.fori_loop(
             0, steps, lambda _, carry: vector_step(*carry), (state, sums, episode_sums)
         )
-        # Where nothing was counted the mean is 0 / 0: the host leaves those out.
-        count = (state.train.update - before).astype(jnp.float32)
+        # Where nothing was counted the mean means nothing, and the host leaves it out.
+        count = jnp.maximum((state.train.update - before).astype(jnp.float32), 1.0)
         metrics = {name: value / count for name, value in sums.items()}
         finished = episode_sums.pop("episodes")
-        metrics |= {name: value / finished for name, value in episode_sums.items()} | {"episodes": finished}
+        metrics |= {name: value / jnp.maximum(finished, 1.0) for name, value in episode_sums.items()}
+        metrics["episodes"] = finished
         # Episodes that the environments cut: because their physics broke down, or an action was not finite.
         for name, count, earlier in zip(
             ("faults", "bad_actions"), (state.env.faults, state.env.bad_actions), cuts_before, strict=True
@@ -357,8 +359,8 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
         env_key, key = jax.random.split(key)
         env_state = prepare_envs(jax.random.split(env_key, episodes))
         zeros = jnp.zeros((episodes,))
-        no = zeros > 0
-        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), no, no)
+        complete, done = jnp.zeros((episodes,), bool), jnp.zeros((episodes,), bool)
+        return (env_state, agent.init_policy(episodes), key, zeros, zeros.astype(jnp.int32), complete, done)
 
     def eval_steps(params: Any, carry: tuple, random: Array, frames: bool) -> tuple[tuple, Any]:
         def step(carry: tuple, _: None) -> tuple[tuple, Any]:
@@ -378,7 +380,7 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
 
         return jax.lax.scan(step, carry, None, length=config.chunk_steps)
 
-    eval_steps_jit = jax.jit(eval_steps, static_argnums=3, donate_argnums=1)
+    eval_steps_jit = jax.jit(in_32_bits(eval_steps), static_argnums=3, donate_argnums=1)
 
     def evaluate(
         params: Any, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False
@@ -400,10 +402,10 @@ def make(config: LoopConfig, env: Any, agent: Any, action_repeat: int, mesh: Mes
     whole = None if mesh is None else parallel.NamedSharding(mesh, parallel.WHOLE)
     out = None if mesh is None else (shardings, whole)
     return Loop(
-        init=init,
-        chunk=jax.jit(parallel.traced_on(mesh, chunk), donate_argnums=0, out_shardings=out),
-        evaluate=evaluate,
-        shapes=shapes_of_state,
+        init=in_32_bits(init),
+        chunk=jax.jit(in_32_bits(parallel.traced_on(mesh, chunk)), donate_argnums=0, out_shardings=out),
+        evaluate=in_32_bits(evaluate),
+        shapes=in_32_bits(shapes_of_state),
         replay_bytes=replay_bytes,
         capacity=capacity,
         chunk_steps=max(1, min(config.chunk_steps, CHUNK_UPDATES * price // max(wage, 1))),
@@ -468,6 +470,7 @@ def _nbytes(tree: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in arrays)
 
 
+@in_32_bits
 def random_action(spec: Any, key: Array, n: int) -> Array:
     """Uniform actions [n, ...] for environments of this action spec."""
     if isinstance(spec, ContinuousAction):

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax import memory, parallel, shapes
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, Batch, ContinuousAction, EnvSpec, Latent, Transition
 
 SHARE = 0.9
@@ -44,6 +45,7 @@ class Replay:
     """K, classes per latent."""
 
 
+@in_32_bits
 def init(
     example: Transition,
     capacity: int,
@@ -77,6 +79,7 @@ def init(
     return Replay(data, position, size, example.latent.stoch.shape[-1])
 
 
+@in_32_bits
 def add(replay: Replay, transition: Transition) -> Replay:
     """The ring with one step of all N environments added, in place of the oldest where it is full.
 
@@ -99,6 +102,7 @@ def can_sample(replay: Replay, length: int) -> Array:
     return replay.size > length
 
 
+@in_32_bits
 def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
     """B sequences of T steps, each with the step before it as context.
 
@@ -136,6 +140,7 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
     return gather(replay.data, row, env)._replace(index=row[:, 1:] * envs + env[:, 1:])
 
 
+@in_32_bits
 def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
     """The ring with newer latents at steps sampled from it.
 
@@ -207,6 +212,7 @@ def check_capacity(
         )
 
 
+@in_32_bits
 def random_batch(
     spec: EnvSpec,
     config: Any,

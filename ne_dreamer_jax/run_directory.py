@@ -80,11 +80,20 @@ def check(path: Path) -> None:
     """Refuses a path that can't be a run directory, whatever the configuration; touches nothing.
 
     Raises:
-      RefusedError: it is a file, or a directory that holds something else.
+      RefusedError: it is a file, a directory that holds something else, or nowhere that could be read and written.
     """
-    if path.exists() and not path.is_dir():
-        raise RefusedError(f"expected a directory, got a file: {path}. Choose another --logdir")
-    contents = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
+    try:
+        if path.exists() and not path.is_dir():
+            raise RefusedError(f"expected a directory, got a file: {path}. Choose another --logdir")
+        contents = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
+        nearest = next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))
+    except OSError as error:
+        raise RefusedError(f"{path} can't be made a run directory: {error}. Choose another --logdir") from error
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise RefusedError(
+            f"{path} can't be made a run directory: expected {nearest} to be one that can be written to. "
+            "Choose another --logdir"
+        )
     if contents and MARKER not in contents:
         shown = ", ".join(contents[:3] + (["..."] if len(contents) > 3 else []))
         raise RefusedError(

@@ -108,3 +108,19 @@ def test_an_evaluation_replaces_the_one_before(tmp_path):
         run_directory.write_evaluation(files, {"return": 1.0})
         run_directory.write_evaluation(files, {"return": 2.0})
         assert json.loads(files.evaluation.read_text()) == {"return": 2.0}
+
+
+@pytest.mark.parametrize("name", [300 * "x", "file/run", "file/a/run", "loop/run"])
+def test_what_can_be_no_directory_is_refused_at_once(tmp_path, name):
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(run_directory.RefusedError, match="--logdir"):
+        run_directory.check(tmp_path / name)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "loop"]
+
+
+def test_a_directory_behind_a_link_is_a_directory(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    (tmp_path / "there").mkdir()
+    run_directory.check(tmp_path / "link" / "run")
+    run_directory.check(tmp_path / "link")

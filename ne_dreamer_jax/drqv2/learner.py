@@ -13,6 +13,7 @@ from ne_dreamer_jax import shapes
 from ne_dreamer_jax.drqv2.config import DrQv2Config
 from ne_dreamer_jax.drqv2.networks import Networks
 from ne_dreamer_jax.drqv2.transitions import Transitions, n_step, random_shift
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, Batch, EnvSpec, Latent, Metrics, Params, TimeStep
 
 BOUND = 1.0 - 1e-6  # of sampled actions
@@ -57,6 +58,7 @@ def critic_loss(values: Array, target: Array, valid: Array) -> Array:
     return _mean(jnp.sum(jnp.square(values - target[:, None]), axis=1), valid)
 
 
+@in_32_bits
 def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
     """``init``, ``init_policy``, ``act`` and ``train_step``, as `Agent` describes them.
 
@@ -152,10 +154,10 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
         return optax.apply_updates(params, updates), optimizer
 
     return (
-        jax.jit(init),
-        init_policy,
-        jax.jit(act, static_argnames="mode"),
-        jax.jit(train_step, donate_argnums=0),
+        jax.jit(in_32_bits(init)),
+        in_32_bits(init_policy),
+        jax.jit(in_32_bits(act), static_argnames="mode"),
+        jax.jit(in_32_bits(train_step), donate_argnums=0),
     )
 
 

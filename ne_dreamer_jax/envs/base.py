@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, ContinuousAction, EnvSpec, TimeStep
 
 CoreState = Any  # a pytree of arrays, without weak types
@@ -114,6 +115,7 @@ def restart_or_step(
     return step_or_restart
 
 
+@in_32_bits
 def from_core(core: Core) -> Env:
     """Adds flags, clipping of actions, auto-reset and the guard against non-finite values to a simulation.
 
@@ -184,9 +186,16 @@ def from_core(core: Core) -> Env:
 
     pictures = core.pictures
     if pictures is not None:
-        record = pictures.record
-        pictures = pictures._replace(record=lambda state: record(state.core))
-    return Env(core.spec, reset, step, lambda state: core.observe(state.core), prepare, pictures)
+        record, redraw = pictures.record, pictures.redraw
+        pictures = Pictures(in_32_bits(lambda state: record(state.core)), in_32_bits(redraw))
+    return Env(
+        core.spec,
+        in_32_bits(reset),
+        in_32_bits(step),
+        in_32_bits(lambda state: core.observe(state.core)),
+        in_32_bits(prepare),
+        pictures,
+    )
 
 
 def _zeros(x: Any) -> Array:

@@ -69,7 +69,12 @@ def build(config, *, image: bool = True) -> training.Run:
         count = episodes or config.loop.eval_episodes
         mean = 0.0 if random else jnp.sum(params["actor"]["kernel"])
         clip = np.zeros((5, 16, 16, 3), np.uint8) if frames and image else None
-        return Evaluation(mean + jax.random.normal(key, (count,)), jnp.full((count,), EPISODE, jnp.int32), clip)
+        return Evaluation(
+            mean + jax.random.normal(key, (count,)),
+            jnp.full((count,), EPISODE, jnp.int32),
+            jnp.ones((count,), bool),
+            clip,
+        )
 
     agent = SimpleNamespace(spec=EnvSpec(observation, ContinuousAction(1)))
     loop = Loop(

@@ -83,7 +83,7 @@ def test_what_does_not_fit_memory_leaves_no_directory(tmp_path):
         "--logdir", tmp_path / "run",
     )  # fmt: skip
     assert code == 2
-    assert "memory" in output or "capacity" in output
+    assert "expected a capacity of at most" in output
     assert not (tmp_path / "run").exists()
 
 

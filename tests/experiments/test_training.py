@@ -202,6 +202,59 @@ def test_an_agent_without_pixels_leaves_no_video(tmp_path):
     assert not (tmp_path / "policy.mp4").exists()
 
 
+@pytest.mark.parametrize("broken", ["no ffmpeg", "in the way", "no frames"])
+def test_a_run_whose_pictures_fail_is_finished_all_the_same(finished, tmp_path, monkeypatch, broken):
+    run = stub.run()
+    do = (lambda line: (tmp_path / "curve.png").mkdir()) if broken == "in the way" else lambda line: None
+    if broken == "no ffmpeg":
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nonexistent/ffmpeg")
+    if broken == "no frames":
+        loop = run.loop
+        evaluate = lambda *args, **options: loop.evaluate(*args, **options)._replace(frames=None)
+        run = run._replace(loop=loop._replace(evaluate=evaluate))
+    for _ in range(2):  # also when it is started again
+        code, lines = train(tmp_path, do, "Compiling", run=run)
+        assert code == 0
+        assert "more episodes" in lines[-1]
+    name = "curve.png" if broken == "in the way" else "policy.mp4"
+    assert sum("Could not draw" in line and name in line for line in lines) == 1  # of the second start
+    assert last_bits(tmp_path) == last_bits(finished[0])
+
+
+def test_an_error_of_the_evaluation_is_no_missing_picture(tmp_path):
+    run = stub.run()
+
+    def evaluate(*args, **options):
+        raise ValueError("from the policy")
+
+    with pytest.raises(ValueError, match="from the policy"):
+        train(tmp_path, run=run._replace(loop=run.loop._replace(evaluate=evaluate)))
+
+
+def hang_up(_line):
+    for _ in range(3):  # as shells and the system do, one after the other
+        os.kill(os.getpid(), signal.SIGHUP)
+
+
+@pytest.mark.strict
+def test_a_terminal_that_is_closed_stops_the_run_where_it_can_go_on(finished, tmp_path, monkeypatch):
+    code, lines = train(tmp_path, hang_up, "env step 48")
+    assert code == 128 + signal.SIGHUP
+    assert "The same command goes on" in lines[-1]
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+    assert train(tmp_path)[0] == 0
+    assert last_bits(tmp_path) == last_bits(finished[0])
+
+
+def test_a_hang_up_is_ignored_where_it_is_to_be(tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        assert train(tmp_path, hang_up, "env step 48")[0] == 0
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.slow
 @pytest.mark.strict
 def test_the_real_loop_goes_on_to_the_same_bits(tmp_path):

@@ -9,10 +9,13 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import jax.numpy as jnp
+
 from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.envs.dmc import environment
 from ne_dreamer_jax.envs.dmc.common import Task
 from ne_dreamer_jax.envs.dmc.simulation import Simulation
+from ne_dreamer_jax.numerics import in_32_bits
 
 __all__ = ["Simulation", "Task", "from_task", "load", "make"]
 
@@ -24,6 +27,7 @@ def load(domain: str, task: str) -> Task:
     return importlib.import_module(f"ne_dreamer_jax.envs.dmc.{domain}").load(task)
 
 
+@in_32_bits
 def make(domain: str, task: str, **options: Any) -> base.Env:
     """Makes a Control Suite environment; options and errors as of ``from_task``.
 
@@ -34,6 +38,7 @@ def make(domain: str, task: str, **options: Any) -> base.Env:
     return from_task(load(domain, task), **options)
 
 
+@in_32_bits
 def from_task(
     task: Task, *, obs: str = "pixels", action_repeat: int = 2, image_size: int = 64, fast: bool = False
 ) -> base.Env:
@@ -51,11 +56,16 @@ def from_task(
       fast: solve constraints with a shorter line search than MuJoCo's, `Simulation.fast`.
 
     Raises:
-      ValueError: an option has a bad value, an actuator has no range or there is none, the task's reward or
-        observations have other shapes than `Task` says, or the picture needs what the renderer does not draw (the
-        message names it).
+      ValueError: an option has a bad value, the simulation was made in JAX's 64-bit mode, an actuator has no range or
+        there is none, the task's reward or observations have other shapes than `Task` says, or the picture needs what
+        the renderer does not draw (the message names it).
     """
     _check(obs=obs, action_repeat=action_repeat, image_size=image_size, fast=fast)
+    if task.simulation.model.qpos0.dtype == jnp.float64:
+        raise ValueError(
+            "expected a task of 32 bits, got one whose simulation was made in JAX's 64-bit mode; make it within "
+            "jax.enable_x64(False)"
+        )
     if fast:
         task = task._replace(simulation=task.simulation.fast())
     return base.from_core(environment.make_core(task, obs, action_repeat, image_size))
