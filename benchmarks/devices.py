@@ -12,8 +12,8 @@ from typing import Any
 
 import click
 
-from experiments.options import Name, quiet, refusing
-from ne_dreamer_jax import names
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
 
 _BYTES = {"pred": 1, "u8": 1, "s8": 1, "bf16": 2, "f16": 2, "u16": 2, "f32": 4, "s32": 4, "u32": 4, "f64": 8}
 _COLLECTIVE = re.compile(
@@ -46,7 +46,7 @@ def main(
 
     from benchmarks import common
     from experiments.train import configure
-    from ne_dreamer_jax import parallel
+    from ne_dreamer_jax.system import parallel
 
     with refusing(ValueError):
         config = configure("dmc", size, None, {}, assignments).agent
@@ -84,8 +84,9 @@ def _compiled(config: Any, mesh: Any) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from ne_dreamer_jax import parallel, replay
-    from ne_dreamer_jax.agent import make_agent
+    from ne_dreamer_jax.agents import make_agent
+    from ne_dreamer_jax.replay import ring as replay
+    from ne_dreamer_jax.system import parallel
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(6))

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import dmc_equality as equality
 from benchmarks.dmc_equality import Arrays
-from experiments.options import UserPath
+from ne_dreamer_jax.commands.options import UserPath
 from ne_dreamer_jax.envs.dmc.common import Episode
 
 TASKS = (

@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
-from experiments.options import Name, quiet, refusing
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import envs, names
+from ne_dreamer_jax import envs
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 PARTS = ("environment", "rendering", "acting", "replay", "learning")
 
@@ -70,7 +71,7 @@ def _parts(config: Any) -> dict[str, Callable[[], Any]]:
     import jax.numpy as jnp
 
     import ne_dreamer_jax as nedreamer
-    from ne_dreamer_jax import replay as replay_lib
+    from ne_dreamer_jax.replay import ring as replay_lib
     from ne_dreamer_jax.types import TimeStep, Transition
 
     options, n = config.env, config.loop.num_envs

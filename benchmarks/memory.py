@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from experiments.options import Name, quiet, refusing
-from ne_dreamer_jax import names
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
 
 FRAMES = 5_000_000  # the paper's replay
 
@@ -44,8 +44,9 @@ def _row(config: Any, size: str, compiles: bool) -> dict[str, Any]:
 
     import ne_dreamer_jax as nedreamer
     from ne_dreamer_jax import loop as loops
-    from ne_dreamer_jax import replay
-    from ne_dreamer_jax.agent import parameter_counts
+    from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
+    from ne_dreamer_jax.loop.budget import PAPER_CAPACITY
+    from ne_dreamer_jax.replay import ring as replay
 
     options, limits = config.env, config.loop
     env = nedreamer.envs.make(options.task, action_repeat=options.action_repeat, image_size=options.image_size)
@@ -68,9 +69,9 @@ def _row(config: Any, size: str, compiles: bool) -> dict[str, Any]:
         """Bytes of a transition in replay."""
         small = replace(limits, capacity=(config.agent.batch_length + 1) * limits.num_envs, **changes)
         loop = loops.make(small, env, agent, options.action_repeat)
-        return loop.replay_bytes / loop.capacity
+        return loop.replay_bytes / loop.budget.capacity
 
-    steps = limits.capacity or min(loops.PAPER_CAPACITY, limits.env_steps // options.action_repeat)
+    steps = limits.capacity or min(PAPER_CAPACITY, limits.env_steps // options.action_repeat)
     return row | {
         "replay_gb": steps * per_step(),
         "pixels_5e6_gb": FRAMES * per_step(storage="pixels"),

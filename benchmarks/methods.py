@@ -8,9 +8,9 @@ from typing import Any
 import click
 
 from benchmarks import common
-from experiments.options import Name, quiet, refusing
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import names
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 METHODS = tuple(name for name in names.METHODS if "/" not in name)
 
@@ -50,7 +50,7 @@ def parameters(agent: Any) -> dict[str, common.Value]:
     import jax
     import jax.numpy as jnp
 
-    from ne_dreamer_jax.agent import parameter_counts
+    from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 
     state = jax.eval_shape(agent.init, jax.random.key(0))
     modules = parameter_counts(state.params)
@@ -62,7 +62,7 @@ def _make(size: str, method: str, actions: int) -> Any:
     import jax.numpy as jnp
 
     from experiments.train import configure
-    from ne_dreamer_jax.agent import make_agent
+    from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     config = configure("dmc", size, method, {})
@@ -75,7 +75,7 @@ def _update(agent: Any) -> tuple[Callable[[], Any], int]:
     """A function that does one update after another on the same batch, and the bytes it needs meanwhile."""
     import jax
 
-    from ne_dreamer_jax import replay
+    from ne_dreamer_jax.replay import ring as replay
 
     batch = jax.jit(lambda key: replay.random_batch(agent.spec, agent.config, key))(jax.random.key(1))
     state = agent.init(jax.random.key(0))

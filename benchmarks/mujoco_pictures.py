@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from experiments.options import UserPath
+from ne_dreamer_jax.commands.options import UserPath
 
 SIZE = 64
 TASKS = {

@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from experiments.options import Name, quiet
 from ne_dreamer_jax import envs
+from ne_dreamer_jax.commands.options import Name, quiet
 
 
 @click.command(context_settings={"max_content_width": 110})

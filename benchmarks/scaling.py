@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from experiments.options import Name, quiet, refusing
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import names
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -40,8 +40,8 @@ def main(
 
     from benchmarks import common
     from experiments.train import configure
-    from ne_dreamer_jax import replay
-    from ne_dreamer_jax.agent import make_agent
+    from ne_dreamer_jax.agents import make_agent
+    from ne_dreamer_jax.replay import ring as replay
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     spec = EnvSpec({"image": ArraySpec((64, 64, 3), jnp.uint8)}, ContinuousAction(actions))

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from experiments.options import quiet
+from ne_dreamer_jax.commands.options import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -27,7 +27,7 @@ def main(envs: int, rows: int, side: int, batch_size: int, batch_length: int, ro
     import jax.numpy as jnp
 
     from benchmarks.common import measure, report
-    from ne_dreamer_jax.host_frames import HostFrames
+    from ne_dreamer_jax.replay.host_frames import HostFrames
     from ne_dreamer_jax.types import ArraySpec
 
     shape = (side, side, 3)

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
-from experiments.options import Name, quiet, refusing
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import names
+from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -29,8 +29,9 @@ from ne_dreamer_jax import names
 def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignments: tuple[str, ...]) -> None:
     """Time the update of a size on 64x64x3 frames (drqv2: 84x84x3), in seconds and in GEMM units."""
     quiet()
-    from ne_dreamer_jax import replay
-    from ne_dreamer_jax.agent import AgentConfig, make_agent, parameter_counts
+    from ne_dreamer_jax.agents import make_agent
+    from ne_dreamer_jax.agents.dreamer.agent import AgentConfig, parameter_counts
+    from ne_dreamer_jax.replay import ring as replay
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     with refusing(ValueError):
@@ -79,8 +80,9 @@ def configure(size: str, method: str, assignments: tuple[str, ...]) -> Any:
 
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:
     """Name -> the part with its gradients, compiled, on inputs of its own."""
-    from ne_dreamer_jax import behavior, optim, world_model
-    from ne_dreamer_jax.agent import world_model_of
+    from ne_dreamer_jax.agents import optim
+    from ne_dreamer_jax.agents.dreamer import behavior, world_model
+    from ne_dreamer_jax.agents.dreamer.agent import world_model_of
     from ne_dreamer_jax.nets.networks import Networks
     from ne_dreamer_jax.nets.rssm import feature, observe
 

@@ -1,8 +1,8 @@
 """The paper's ablations on one task: ``python -m experiments.ablations --help``."""
 
 from experiments.compare import command
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import names
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 main = command(
     [name for name in names.METHODS if name.split("/")[0] == "ne_dreamer"],

@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from experiments.options import Name, UserPath, as_argument, quiet, refusing, say
-from experiments.pages import use_large_pages
-from ne_dreamer_jax import envs, names, run_directory
+from ne_dreamer_jax import envs
+from ne_dreamer_jax.commands.options import Name, UserPath, quiet, refusing, say
+from ne_dreamer_jax.runs import run_directory
+from ne_dreamer_jax.runs.run_directory import as_argument
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
 
 if TYPE_CHECKING:
     import numpy as np
@@ -88,7 +91,7 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
 
 def train(path: Path, options: Sequence[str]) -> None:
     """One run, in a process of its own; ends this one where it fails or is stopped."""
-    arguments = [sys.executable, "-m", "experiments.train", *options, "--logdir", as_argument(path)]
+    arguments = [sys.executable, "-m", "ne_dreamer_jax", "train", *options, "--logdir", as_argument(path)]
     code = subprocess.run(arguments, check=False).returncode
     if code:
         raise SystemExit(code)
@@ -99,8 +102,8 @@ def finished(path: Path) -> bool:
     files = run_directory.RunDirectory(path)
     if not files.config.exists():
         return False
-    from ne_dreamer_jax import metrics
     from ne_dreamer_jax.config import Config
+    from ne_dreamer_jax.runs import metrics
 
     budget = run_directory.read_config(path, Config).loop.env_steps
     return any("eval/return" in line and line["env_step"] >= budget for line in metrics.read(files.metrics))
@@ -112,8 +115,8 @@ def find(directory: Path) -> list[Found]:
     Raises:
       ValueError: there is none, or they are of different tasks.
     """
-    from ne_dreamer_jax import metrics
     from ne_dreamer_jax.config import Config
+    from ne_dreamer_jax.runs import metrics
 
     found = []
     for marker in sorted(directory.rglob(run_directory.MARKER)):
@@ -136,7 +139,7 @@ def draw(found: Sequence[Found], path: Path) -> list[str]:
     """Draws the figure; returns a table, one line a method: mean and range over seeds of the last evaluation."""
     import numpy as np
 
-    from experiments import pictures, plots
+    from ne_dreamer_jax.runs import pictures, plots
 
     by_method: dict[str, list[Found]] = {}
     for run in found:

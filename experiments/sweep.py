@@ -18,8 +18,10 @@ from typing import Any, NamedTuple
 
 import click
 
-from experiments.options import Name, UserPath, as_argument, say
-from ne_dreamer_jax import envs, names
+from ne_dreamer_jax import envs
+from ne_dreamer_jax.commands.options import Name, UserPath, say
+from ne_dreamer_jax.runs.run_directory import as_argument
+from ne_dreamer_jax.settings import names
 
 POLL = 2.0  # seconds between two looks at the jobs
 
@@ -138,7 +140,7 @@ def plan(
     for seed, task, method in itertools.product(seeds, dict.fromkeys(tasks), dict.fromkeys(methods)):
         folder = logdir / task.replace("/", "_") / method.replace("/", "_") / f"seed{seed}"
         own = ["--task", task, "--method", method, "--seed", str(seed), "--logdir", as_argument(folder)]
-        command = (sys.executable, "-m", "experiments.train", *shared, *own)
+        command = (sys.executable, "-m", "ne_dreamer_jax", "train", *shared, *own)
         runs.append(Run(f"{task} {method} seed {seed}", folder, command))
     return runs
 

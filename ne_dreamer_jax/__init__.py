@@ -7,6 +7,9 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["config", "envs", "losses", "objectives", "render", "replay", "types"],
-    submod_attrs={"agent": ["Agent", "AgentConfig", "make_agent"]},
+    submodules=["agents", "config", "envs", "loop", "losses", "objectives", "render", "replay", "settings", "types"],
+    submod_attrs={
+        "agents": ["Agent", "AgentConfig", "make_agent"],
+        "runs": ["checkpoint", "metrics", "run_directory"],
+    },
 )

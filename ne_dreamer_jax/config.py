@@ -10,20 +10,22 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from ne_dreamer_jax import drqv2, ranges, settings
-from ne_dreamer_jax.agent import AgentConfig
-from ne_dreamer_jax.behavior import BehaviorConfig
-from ne_dreamer_jax.drqv2 import DrQv2Config
-from ne_dreamer_jax.loop import LoopConfig
+from ne_dreamer_jax import settings
+from ne_dreamer_jax.agents import drqv2
+from ne_dreamer_jax.agents.dreamer.agent import AgentConfig
+from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
+from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
+from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.agents.optim import OptimizerConfig
+from ne_dreamer_jax.loop import budget
+from ne_dreamer_jax.loop.config import LoopConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
-from ne_dreamer_jax.optim import OptimizerConfig
-from ne_dreamer_jax.ranges import LARGEST, Range
-from ne_dreamer_jax.settings import did_you_mean
-from ne_dreamer_jax.world_model import WorldModelConfig
+from ne_dreamer_jax.settings import did_you_mean, ranges
+from ne_dreamer_jax.settings.ranges import LARGEST, Range
 
 SIZES: dict[str, dict[str, int]] = {
     # DreamerV3's sizes: deter D, hidden, classes K, encoder depth, units.
@@ -192,17 +194,17 @@ def _with_objective(config: Config, agent: AgentConfig, objective: AnyObjective)
 
 def _drqv2(config: Config, shared: AgentConfig) -> Config:
     published, env, loop = drqv2.for_task(config.env.task), config.env, config.loop
-    steps_per_update = shared.batch_size * shared.batch_length / loop.replay_ratio
+    every = budget.steps_per_update(shared.batch_size, shared.batch_length, loop.replay_ratio)
     agent = replace(
         published,
         batch_size=min(published.batch_size, shared.batch_size * shared.batch_length),
-        steps_per_update=steps_per_update,
+        steps_per_update=every,
         random_steps=min(loop.prefill, drqv2.SEED_FRAMES // env.action_repeat),
     )
     image_size = drqv2.IMAGE_SIZE if env.image_size == EnvConfig.image_size else env.image_size
     loop = replace(
         loop,
-        replay_ratio=agent.batch_size * agent.batch_length / steps_per_update,
+        replay_ratio=budget.replay_ratio(agent.batch_size, agent.batch_length, every),
         prefill=agent.random_steps,
         write_latents=False,
     )

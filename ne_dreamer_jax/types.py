@@ -75,6 +75,11 @@ class EnvSpec(NamedTuple):
     action: ActionSpec
 
 
+def images_of(spec: EnvSpec) -> dict[str, ArraySpec]:
+    """The observations that are images, by their spec: uint8 [H, W, C]."""
+    return {name: s for name, s in spec.observation.items() if s.dtype == jnp.uint8 and len(s.shape) == 3}
+
+
 class TimeStep(NamedTuple):
     """What an environment returns. All fields may carry leading batch axes."""
 

@@ -17,11 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax import agent as agents
-from ne_dreamer_jax import checkpoint, parallel
+from ne_dreamer_jax import agents
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax.host_frames import HostFrames
 from ne_dreamer_jax.loop import LoopConfig
+from ne_dreamer_jax.replay.host_frames import HostFrames
+from ne_dreamer_jax.runs import checkpoint
+from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax.types import ArraySpec
 from tests import counting, tiny
 
@@ -46,7 +47,7 @@ def stub_loop(devices: int, storage: str = "pixels") -> loops.Loop:
     agent = counting.stub(env.spec, B)
     loop = loops.make(dataclasses.replace(CONFIG, storage=storage), env, agent, action_repeat=1, mesh=mesh)
     jitted: Any = loop.chunk
-    return loop._replace(chunk=jitted.lower(loop.shapes(), jax.ShapeDtypeStruct((), jnp.int32)).compile())
+    return loop._replace(chunk=jitted.lower(loop.state_shapes(), jax.ShapeDtypeStruct((), jnp.int32)).compile())
 
 
 def ran(loop: loops.Loop, state: Any, steps: int) -> Any:
@@ -67,7 +68,7 @@ def same(a: Any, b: Any) -> bool:
 
 def placed(loop: loops.Loop, state: Any) -> bool:
     """Whether every array lies where the loop says."""
-    pairs = zip(jax.tree.leaves(state), jax.tree.leaves(loop.shapes()), strict=True)
+    pairs = zip(jax.tree.leaves(state), jax.tree.leaves(loop.state_shapes()), strict=True)
     return all(x.sharding.is_equivalent_to(want.sharding, x.ndim) for x, want in pairs)
 
 
@@ -129,8 +130,8 @@ def moved() -> dict[str, bool]:
         state = ran(old, old.init(jax.random.key(0)), 9)
         with tempfile.TemporaryDirectory() as folder:
             checkpoint.save(Path(folder), 9, {"all": state})
-            restored = checkpoint.restore(Path(folder), {"all": new.shapes()}).items["all"]
-        state = parallel.move(restored, new.shapes())
+            restored = checkpoint.restore(Path(folder), {"all": new.state_shapes()}).items["all"]
+        state = parallel.move(restored, new.state_shapes())
         out[f"{before} to {after}"] = same(ran(new, state, STEPS - 9), want) and (after == 1 or placed(new, state))
     return out
 
@@ -146,7 +147,7 @@ def whole_agent() -> dict[str, Any]:
         loop = loops.make(dataclasses.replace(CONFIG, replay_ratio=2.0), env, agent, 1, mesh)
         # The parameters come from numpy; compiling their initialisation would take longer than all the rest.
         rest = stub_loop(1).init(jax.random.key(0))
-        shapes = loop.shapes()
+        shapes = loop.state_shapes()
         replay = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.replay)
         start = rest._replace(train=tiny.state(agent), policy=agent.init_policy(N), replay=replay)
         state, curve = parallel.move(start, shapes), []

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import jax
 
-from experiments import training
-from ne_dreamer_jax import parallel, run_directory
+from ne_dreamer_jax.runs import run_directory, training
+from ne_dreamer_jax.system import parallel
 from tests.experiments import toy
 
 

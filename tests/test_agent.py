@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import make_agent, replay
-from ne_dreamer_jax.agent import parameter_counts
+from ne_dreamer_jax import make_agent
+from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
+from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
+from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
-from ne_dreamer_jax.world_model import WorldModelConfig
 from tests import tiny
 from tests.tiny import assert_same
 

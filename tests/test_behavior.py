@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ne_dreamer_jax import behavior, world_model
-from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.agents.dreamer import behavior, world_model
+from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
 from ne_dreamer_jax.losses import lambda_returns, return_scale, symexp_bins, twohot_mean, update_percentiles
 from ne_dreamer_jax.nets.heads import policy
 from ne_dreamer_jax.nets.rssm import RSSM

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ne_dreamer_jax import checkpoint
+from ne_dreamer_jax.runs import checkpoint
 
 
 class State(NamedTuple):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from ne_dreamer_jax import compile_cache
+from ne_dreamer_jax.system import compile_cache
 
 
 @pytest.fixture(autouse=True)

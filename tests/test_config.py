@@ -9,16 +9,19 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import training
-from experiments.schedule import Schedule
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import drqv2, envs, make_agent, names, objectives, optim, replay, settings, world_model
+from ne_dreamer_jax import envs, make_agent, objectives
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax.agent import BASE_LOSS_SCALES
-from ne_dreamer_jax.behavior import actor_critic_losses
-from ne_dreamer_jax.config import Config, EnvConfig
+from ne_dreamer_jax.agents import drqv2, optim
+from ne_dreamer_jax.agents.dreamer import world_model
+from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
+from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
+from ne_dreamer_jax.config import Config, EnvConfig, names, settings
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
+from ne_dreamer_jax.replay import ring as replay
+from ne_dreamer_jax.runs import training
+from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout, TimeStep
 from tests import counting, tiny
 from tests.drqv2 import small
@@ -163,8 +166,8 @@ def test_the_defaults_are_the_papers():
     assert agent.loss_scales == {**BASE_LOSS_SCALES, "next_embedding": 1.0}
     # "Replayed steps per policy step": what the run replays over what it acts, once it learns.
     env = counting.env()
-    budget = loops.make(loop, env, counting.stub(env.spec, 16, 64), 2)
-    acting = budget.vector_steps * 16 - loop.prefill
+    budget = loops.make(loop, env, counting.stub(env.spec, 16, 64), 2).budget
+    acting = budget.vector_steps * 16 - budget.prefill * 16
     assert budget.updates * 16 * 64 / acting == pytest.approx(512, rel=1e-3)
 
 
@@ -515,7 +518,7 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
     for name, value in changes.items():
         run = training.build(configs.override(BASE, f"env.{name}={value}"))
         assert asked[-1] != asked[0], name
-        assert (run.loop.vector_steps != base.vector_steps) == (name == "action_repeat")
+        assert (run.loop.budget.vector_steps != base.budget.vector_steps) == (name == "action_repeat")
 
 
 def test_there_are_no_other_settings():

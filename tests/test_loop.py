@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ne_dreamer_jax import agent as agents
+from ne_dreamer_jax import agents
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.loop import LoopConfig
 from tests import counting, tiny
@@ -40,8 +40,8 @@ def ran(loop, *chunks, seed=0):
     """The state after chunks of these many steps, and the metrics of each."""
     state, out = loop.init(jax.random.key(seed)), []
     for n in chunks:
-        state, metrics = loop.chunk(state, steps(n))
-        out.append(jax.device_get(metrics))
+        state, report = loop.chunk(state, steps(n))
+        out.append(jax.device_get(report))
     return state, out
 
 
@@ -52,7 +52,7 @@ def filled(request):
     loop = make(discrete, image, prefill=1000)
     state, metrics = ran(loop, STEPS)
     return SimpleNamespace(
-        discrete=discrete, image=image, state=state, metrics=metrics[0], data=jax.device_get(state.replay.data)
+        discrete=discrete, image=image, state=state, metrics=metrics[0].means(), data=jax.device_get(state.replay.data)
     )
 
 
@@ -154,10 +154,10 @@ def test_metrics_are_means_over_the_chunks_updates(learning):
     (metrics,) = learning.whole[1]
     total = int(learning.whole[0].train.update)
     assert total > 3
-    assert metrics["update"] == (total + 1) / 2  # the stub reports its number
-    nothing, _, none, _ = learning.parts[1]
-    assert nothing["update"] == 0  # a mean over nothing is not NaN, at which JAX_DEBUG_NANS would stop
-    assert none["return"] == none["length"] == 0
+    assert metrics.means()["update"] == (total + 1) / 2  # the stub reports its number
+    nothing, _, none, _ = (report.means() for report in learning.parts[1])
+    assert "update" not in nothing, "a mean over nothing"
+    assert not {"return", "length"} & set(none)
     assert none["episodes"] == 0
 
 
@@ -168,7 +168,7 @@ def test_the_replay_ratio_and_prefill_decide_how_often_it_learns(ratio, prefill)
     loop = make(replay_ratio=ratio, prefill=prefill)
     before = max(-(-prefill // N), 4)  # not before there is a sequence of 3 steps and the one before it
     due = Fraction(str(ratio)) * N * max(0, STEPS - before) / (2 * 3)
-    assert loop.updates == int(due)
+    assert loop.budget.updates == int(due)
 
 
 @pytest.mark.parametrize(("ratio", "prefill"), [(0.3, 0), (2.5, 31)])
@@ -181,7 +181,7 @@ def test_it_learns_as_often_as_it_says(ratio, prefill):
     before = max(-(-prefill // N), 4)
     due = [int(Fraction(str(ratio)) * N * max(0, t + 1 - before) / 6) for t in range(STEPS)]
     assert done == due
-    assert done[-1] == loop.updates > 0
+    assert done[-1] == loop.budget.updates > 0
 
 
 def test_updates_learn_from_the_newest_parameters_and_latents_return_to_replay(learning):
@@ -209,13 +209,13 @@ def test_runs_of_several_seeds_at_once_are_those_runs(learning):
     assert together.replay.position.shape == together.counters.vector_step.shape == ()
     for n in (5, STEPS - 5):
         together, metrics = chunk(together, steps(n))
-    assert metrics["update"].shape == (2,)
+    assert metrics.learning["update"].shape == (2,)
     for i, seed in enumerate(seeds):
         alone, (_, want) = ran(learning.loop, 5, STEPS - 5, seed=seed)
         one = jax.tree.map(operator.itemgetter(i), together._replace(counters=(), replay=together.replay.data))
         ring = dataclasses.replace(together.replay, data=one.replay)
         assert_same(one._replace(counters=together.counters, replay=ring), alone)
-        np.testing.assert_allclose(metrics["update"][i], want["update"])
+        np.testing.assert_allclose(metrics.learning["update"][i], want.learning["update"])
 
 
 def test_replay_gets_nine_tenths_of_what_the_learner_leaves(monkeypatch):
@@ -302,7 +302,7 @@ def test_images_on_the_host_are_refused_where_they_can_not_be(monkeypatch):
     loop = make(image=True, storage="host")
     images, rest = loop.frames.nbytes, loop.replay_bytes - loop.frames.nbytes
     working = counting.stub(counting.env().spec).working_bytes(None)
-    learner = sum(x.nbytes for x in jax.tree.leaves(loop.shapes().train) if hasattr(x, "nbytes")) + working
+    learner = sum(x.nbytes for x in jax.tree.leaves(loop.state_shapes().train) if hasattr(x, "nbytes")) + working
     monkeypatch.setattr(loops.memory, "available", lambda: 2**40)
     monkeypatch.setattr(loops.memory, "host_available", lambda: int(images / 2 / 0.9) + rest + learner + 200)
     with pytest.raises(ValueError, match=r"loop.storage: the images of .* expected a loop.capacity of at most"):
@@ -371,7 +371,7 @@ def test_random_evaluation_takes_uniform_actions(discrete):
 )
 def test_the_budget_is_counted_in_environment_steps(changes, steps, capacity):
     loop = make(**changes)
-    assert (loop.vector_steps, loop.capacity) == (steps, capacity)
+    assert (loop.budget.vector_steps, loop.budget.capacity) == (steps, capacity)
     state = jax.eval_shape(loop.init, jax.random.key(0))
     assert loop.replay_bytes == sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.replay.data))
 
@@ -418,7 +418,7 @@ def test_the_whole_agent_learns_in_the_loop(whole):
     with jax.transfer_guard("disallow"):
         state, metrics = loop.chunk(state, ten)
         jax.block_until_ready(metrics)
-    assert int(state.train.update) == loop.updates > 5
+    assert int(state.train.update) == loop.budget.updates > 5
     assert all(np.isfinite(x) for name, x in metrics.items() if name != "return" and name != "length")
     assert {f"loss/{name}" for name in tiny.CONFIG.loss_scales} <= set(metrics)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from ne_dreamer_jax import memory
+from ne_dreamer_jax.system import memory
 
 
 def test_the_host_can_give_something_and_not_more_than_it_has():

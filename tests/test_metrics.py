@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ne_dreamer_jax import metrics
-from ne_dreamer_jax.metrics import Counters
+from ne_dreamer_jax.runs import metrics
+from ne_dreamer_jax.runs.metrics import StepCounts
 
 
 def write(path, steps, name="train/return"):
     with metrics.Writer(path) as writer:
         for step in steps:
-            writer.write(Counters(2 * step, step, step // 4), {name: float(step), "train/episodes": step})
+            writer.write(StepCounts(2 * step, step, step // 4), {name: float(step), "train/episodes": step})
 
 
 def test_a_line_is_plain_json_with_counters_first(tmp_path):
     path = tmp_path / "metrics.jsonl"
     with metrics.Writer(path) as writer:
         values = {"a": jnp.float32(0.5), "b": np.int32(3), "c": 4, "d": True, "e": math.inf, "f": math.nan}
-        writer.write(Counters(20, 10, 2), values)
+        writer.write(StepCounts(20, 10, 2), values)
     assert path.read_text() == (
         '{"env_step": 20, "agent_step": 10, "update": 2, "a": 0.5, "b": 3, "c": 4, "d": 1, "e": null, "f": null}\n'
     )
@@ -36,7 +36,7 @@ def test_values_read_back_exactly(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("run") / "metrics.jsonl"
     with metrics.Writer(path) as writer:
         for step, value in enumerate(values):
-            writer.write(Counters(step, step, 0), {"x": np.float32(value)})
+            writer.write(StepCounts(step, step, 0), {"x": np.float32(value)})
     steps, read = metrics.series(metrics.read(path), "x")
     np.testing.assert_array_equal(read.astype(np.float32), np.asarray(values, np.float32))
     np.testing.assert_array_equal(steps, np.arange(len(values)))
@@ -65,7 +65,7 @@ def test_resume_keeps_null_and_starts_a_file_where_there_is_none(tmp_path):
     path = tmp_path / "metrics.jsonl"
     assert metrics.resume(path, 5) == []
     with metrics.Writer(path) as writer:
-        writer.write(Counters(1, 1, 1), {"loss": math.nan})
+        writer.write(StepCounts(1, 1, 1), {"loss": math.nan})
     before = path.read_text()
     metrics.resume(path, 5)
     assert path.read_text() == before
@@ -92,6 +92,6 @@ def test_a_foreign_line_is_refused_by_its_number(tmp_path, text):
 def test_misuse_is_refused(tmp_path):
     with metrics.Writer(tmp_path / "metrics.jsonl") as writer:
         with pytest.raises(ValueError, match="expected names other than the counters"):
-            writer.write(Counters(1, 1, 1), {"update": 3})
+            writer.write(StepCounts(1, 1, 1), {"update": 3})
         with pytest.raises(ValueError, match=r"expected a scalar, got an array of shape \(2,\)"):
-            writer.write(Counters(1, 1, 1), {"x": np.zeros(2)})
+            writer.write(StepCounts(1, 1, 1), {"x": np.zeros(2)})

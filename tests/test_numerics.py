@@ -12,8 +12,8 @@ import pytest
 
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax import replay
 from ne_dreamer_jax.envs import dmc, probes
+from ne_dreamer_jax.replay import ring as replay
 from tests import tiny
 from tests.drqv2 import small
 from tests.experiments import toy
@@ -42,7 +42,7 @@ def build(method, observation):
 def types(method, observation):
     """Of state, metrics, a batch out of replay and one of noise, without compiling anything."""
     loop, config, spec = build(method, observation)
-    state, metrics = jax.eval_shape(loop.chunk, loop.shapes(), jax.ShapeDtypeStruct((), jnp.int32))
+    state, metrics = jax.eval_shape(loop.chunk, loop.state_shapes(), jax.ShapeDtypeStruct((), jnp.int32))
     draw = lambda ring, key: replay.sample(ring, key, 2, config.batch_length)
     batch = jax.eval_shape(draw, state.replay, jax.random.key(0))
     noise = jax.eval_shape(lambda key: replay.random_batch(spec, config, key), jax.random.key(0))

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from ne_dreamer_jax.optim import OptimizerConfig, clip_per_tensor, make
+from ne_dreamer_jax.agents.optim import OptimizerConfig, clip_per_tensor, make
 
 PLAIN = {"agc": math.inf, "warmup": 0, "learning_rate": 0.01}
 

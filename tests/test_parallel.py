@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax import metrics, parallel
+from ne_dreamer_jax.runs import metrics
+from ne_dreamer_jax.system import parallel
 from tests import counting
 
 ROOT = Path(__file__).parents[1]

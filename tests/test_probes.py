@@ -12,17 +12,18 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import make_agent, replay
-from ne_dreamer_jax.agent import AgentConfig
-from ne_dreamer_jax.behavior import BehaviorConfig
-from ne_dreamer_jax.drqv2 import DrQv2Config
+from ne_dreamer_jax import make_agent
+from ne_dreamer_jax.agents.dreamer.agent import AgentConfig
+from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
+from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.envs import probes
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding
-from ne_dreamer_jax.optim import OptimizerConfig
+from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.types import EnvSpec, TimeStep, Transition
 
 NUM_ENVS, STEPS, CAPACITY = 8, 32, 16_384

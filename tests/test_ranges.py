@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import ranges, settings
-from ne_dreamer_jax.drqv2 import DrQv2Config
+from ne_dreamer_jax import settings
+from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.settings import ranges
 
 
 def classes(cls=configs.Config):

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from experiments import train
-from ne_dreamer_jax import names
+from ne_dreamer_jax.settings import names
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ne_dreamer_jax import memory, replay
+from ne_dreamer_jax.replay import ring as replay
+from ne_dreamer_jax.system import memory
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, DiscreteAction, EnvSpec, Latent, Transition
 
 N, C, S, K = 3, 7, 2, 5

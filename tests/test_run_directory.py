@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from ne_dreamer_jax import run_directory
-from ne_dreamer_jax.run_directory import RefusedError
+from ne_dreamer_jax.runs import run_directory
+from ne_dreamer_jax.runs.run_directory import RefusedError
 
 
 @dataclasses.dataclass(frozen=True)

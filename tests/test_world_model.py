@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ne_dreamer_jax import world_model
+from ne_dreamer_jax.agents.dreamer import world_model
+from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
 from ne_dreamer_jax.losses import balanced_kl, symexp_bins, twohot_loss
 from ne_dreamer_jax.nets.rssm import RSSM
 from ne_dreamer_jax.types import PolicyState, TimeStep
-from ne_dreamer_jax.world_model import WorldModelConfig
 from tests import tiny
 from tests.tiny import assert_same
 

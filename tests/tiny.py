@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.agent import BASE_LOSS_SCALES, AgentConfig, world_model_of
-from ne_dreamer_jax.behavior import BehaviorConfig
+from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES, AgentConfig, world_model_of
+from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
+from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import DreamerPro, Model, NextEmbedding, NoObjective, Reconstruction, SameStep
-from ne_dreamer_jax.optim import OptimizerConfig
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, DiscreteAction, EnvSpec, Latent
 
 IMAGE, VECTOR = ArraySpec((8, 8, 3), jnp.uint8), ArraySpec((3,), jnp.float32)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.numerics import in_32_bits
+from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, ContinuousAction, EnvSpec, TimeStep
 
 CoreState = Any  # a pytree of arrays, without weak types
@@ -50,6 +50,7 @@ class Core(NamedTuple):
     step: Callable[[CoreState, Array, Array, Array], tuple[CoreState, Progress]]
     observe: Callable[[CoreState], dict[str, Array]]  # as spec.observation; the only place where pixels are drawn
     pictures: Pictures | None = None  # where the observation has an "image" that can be drawn again
+    step_seconds: float | None = None  # simulated time of a step, where there is such
     blank: Callable[[], CoreState] | None = None  # a state for ``step`` to begin the first episode from; none: zeros
 
 
@@ -76,7 +77,8 @@ class Env(NamedTuple):
     ``observe(state) -> obs``, the observation of the state's time step over again;
     ``prepare(key) -> EnvState``, a state from which the first ``step`` begins an episode. A program that starts there
     needs no ``reset``, whose compilation costs as much as that of ``step``;
-    ``pictures``, how images can be drawn again from less, or None.
+    ``pictures``, how images can be drawn again from less, or None;
+    ``step_seconds``, the simulated time of a step, or None.
 
     After a time step with ``is_last`` the next ``step`` ignores its action and returns the first time step of a new
     episode (``is_first``, reward 0), started from a key never used before.
@@ -88,6 +90,7 @@ class Env(NamedTuple):
     observe: Callable[[EnvState], dict[str, Array]]
     prepare: Callable[[Array], EnvState]
     pictures: Pictures | None = None
+    step_seconds: float | None = None
 
 
 def if_needed(needed: Array, compute: Callable[[], T], otherwise: T) -> T:
@@ -195,6 +198,7 @@ def from_core(core: Core) -> Env:
         in_32_bits(lambda state: core.observe(state.core)),
         in_32_bits(prepare),
         pictures,
+        core.step_seconds,
     )
 
 

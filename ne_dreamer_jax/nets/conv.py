@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax import parallel
-from ne_dreamer_jax.nets import cpu_conv
 from ne_dreamer_jax.nets.blocks import rms_norm
-from ne_dreamer_jax.nets.cpu_conv import Stage as Stage
+from ne_dreamer_jax.nets.cpu import conv as cpu_conv
+from ne_dreamer_jax.nets.cpu.conv import Stage as Stage
 from ne_dreamer_jax.nets.platform import on_cpu
+from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax.types import Array
 
 

@@ -10,11 +10,11 @@ import flax.linen as nn
 import jax.numpy as jnp
 from flax.linen import initializers
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import symlog
 from ne_dreamer_jax.nets import conv
 from ne_dreamer_jax.nets.blocks import MLP, kernel_init
-from ne_dreamer_jax.ranges import Range, Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Range, Width
 from ne_dreamer_jax.types import Array, ArraySpec
 
 

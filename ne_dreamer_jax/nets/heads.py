@@ -9,11 +9,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import unimix_logits
 from ne_dreamer_jax.nets.blocks import MLP, Linear
 from ne_dreamer_jax.nets.rssm import sample_onehot
-from ne_dreamer_jax.ranges import Depth, NonNegative, Positive, Range, Share, Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Depth, NonNegative, Positive, Range, Share, Width
 from ne_dreamer_jax.types import ActionSpec, Array, DiscreteAction
 
 

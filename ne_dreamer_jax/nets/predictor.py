@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.nets.blocks import Linear
-from ne_dreamer_jax.ranges import Depth, Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Depth, Width
 from ne_dreamer_jax.types import Array
 
 

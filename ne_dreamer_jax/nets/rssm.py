@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import unimix_logits
 from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init, per_block
-from ne_dreamer_jax.ranges import Depth, Share, Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Depth, Share, Width
 from ne_dreamer_jax.types import Array, Latent
 
 

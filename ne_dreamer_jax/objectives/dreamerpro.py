@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import assignment_loss, sinkhorn
 from ne_dreamer_jax.nets.blocks import Linear
 from ne_dreamer_jax.objectives.augment import random_shift
 from ne_dreamer_jax.objectives.base import Model, Objective
-from ne_dreamer_jax.ranges import CountOrNone, Positive, Range, Share, Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import CountOrNone, Positive, Range, Share, Width
 from ne_dreamer_jax.types import Array, Batch, Metrics, Params, Rollout
 
 

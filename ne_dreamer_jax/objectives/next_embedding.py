@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import cosine_alignment, next_embedding_loss, vicreg
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
-from ne_dreamer_jax.ranges import NonNegative, Positive, Range
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import NonNegative, Positive, Range
 from ne_dreamer_jax.types import Array, DiscreteAction, Metrics, Params, Rollout
 
 ALIGNMENTS: dict[str, Any] = {"barlow_twins": None, "cosine": cosine_alignment, "vicreg": vicreg}

@@ -8,12 +8,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import image_loss, vector_loss
 from ne_dreamer_jax.nets.decoder import Decoder
 from ne_dreamer_jax.nets.rssm import initial_latent
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
-from ne_dreamer_jax.ranges import Width
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Width
 from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax import ranges
 from ne_dreamer_jax.losses import barlow_twins
 from ne_dreamer_jax.nets.blocks import Linear
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
-from ne_dreamer_jax.ranges import NonNegative
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import NonNegative
 from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
 
 

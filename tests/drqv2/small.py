@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax import replay
-from ne_dreamer_jax.drqv2 import DrQv2Config
+from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, EnvSpec, Latent
 
 IMAGE = EnvSpec({"image": ArraySpec((16, 17, 3), jnp.uint8)}, ContinuousAction(2))

@@ -10,11 +10,11 @@ import optax
 import pytest
 
 from ne_dreamer_jax import make_agent
-from ne_dreamer_jax.drqv2 import DrQv2Config
-from ne_dreamer_jax.drqv2.config import DIFFICULTY, NOISE_STEPS, for_task
-from ne_dreamer_jax.drqv2.learner import critic_loss, noise, sample
-from ne_dreamer_jax.drqv2.networks import Networks, space_to_depth, stride_two
-from ne_dreamer_jax.drqv2.transitions import n_step
+from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.agents.drqv2.config import DIFFICULTY, NOISE_STEPS, for_task
+from ne_dreamer_jax.agents.drqv2.learner import critic_loss, noise, sample
+from ne_dreamer_jax.agents.drqv2.networks import Networks, space_to_depth, stride_two
+from ne_dreamer_jax.agents.drqv2.transitions import n_step
 from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, DiscreteAction, EnvSpec, TimeStep
 from tests.drqv2 import small

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import training
 from ne_dreamer_jax import config as configs
+from ne_dreamer_jax.runs import training
 from tests.drqv2 import small
 from tests.experiments import test_training, toy
 
@@ -37,7 +37,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path, config):
     assert test_training.last_bits(tmp_path / "stopped") == test_training.last_bits(tmp_path / "straight")
     lines = test_training.measured(tmp_path / "straight")
     assert test_training.measured(tmp_path / "stopped") == lines
-    assert lines[-1]["update"] == run.loop.updates > 3
+    assert lines[-1]["update"] == run.loop.budget.updates > 3
     losses = [line[name] for line in lines for name in line if name.startswith("train/loss/")]
     assert len(losses) > 3
     assert np.isfinite(losses).all()
@@ -46,8 +46,8 @@ def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path, config):
 def test_the_clocks_of_acting_and_learning_agree(config):
     """Agent steps as acting counts them, and as the updates imply them."""
     run = training.build(config, toy.env())
-    steps, updates = run.loop.vector_steps * config.loop.num_envs, run.loop.updates
-    implied = run.loop.prefill + config.agent.steps_per_update * updates
+    steps, updates = run.loop.budget.vector_steps * config.loop.num_envs, run.loop.budget.updates
+    implied = run.loop.budget.prefill * config.loop.num_envs + config.agent.steps_per_update * updates
     assert steps - config.agent.steps_per_update <= implied <= steps
     state = jax.eval_shape(run.loop.init, jax.random.key(0))
     assert state.policy.step.shape == ()

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ne_dreamer_jax.drqv2.learner import push
-from ne_dreamer_jax.drqv2.transitions import crop, n_step, random_shift
+from ne_dreamer_jax.agents.drqv2.learner import push
+from ne_dreamer_jax.agents.drqv2.transitions import crop, n_step, random_shift
 from ne_dreamer_jax.types import Batch
 from tests.drqv2.small import nothing
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import training
-from ne_dreamer_jax.host_frames import HostFrames
-from ne_dreamer_jax.loop import Counters, Evaluation, Loop, LoopState
+from ne_dreamer_jax.loop import Budget, Counters, Evaluation, Finished, Loop, LoopState, Report
+from ne_dreamer_jax.replay.host_frames import HostFrames
+from ne_dreamer_jax.runs import training
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, ReturnScale, TrainState
 from tests.experiments import toy
 
@@ -54,16 +54,14 @@ def build(config, *, image: bool = True) -> training.Run:
 
     @functools.partial(jax.jit, donate_argnums=0)
     def chunk(state: LoopState, steps: Array):
-        before = state.counters.vector_step
+        before, updates = state.counters.vector_step, state.train.update
         state = jax.lax.fori_loop(0, steps, lambda _, state: step(state), state)
         kernel = jnp.sum(state.train.params["actor"]["kernel"])
         episodes = (n * (state.counters.vector_step // EPISODE - before // EPISODE)).astype(jnp.float32)
-        metrics = {
-            "loss/total": jnp.square(kernel),
-            "return": kernel / episodes * episodes,
-            "length": episodes / episodes,
-        }
-        return state, metrics | {"episodes": episodes, "faults": jnp.zeros(())}
+        updates = state.train.update - updates
+        none = jnp.zeros((), jnp.int32)
+        finished = Finished(episodes, kernel * episodes, EPISODE * episodes)
+        return state, Report(updates, {"loss/total": jnp.square(kernel) * updates}, finished, none, none)
 
     def evaluate(params, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False):
         count = episodes or config.loop.eval_episodes
@@ -81,16 +79,12 @@ def build(config, *, image: bool = True) -> training.Run:
         init,
         chunk,
         evaluate,
-        shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
+        state_shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
+        budget=Budget(n, config.env.action_repeat, total, prefill, 1, 1, total * n, config.loop.chunk_steps),
         replay_bytes=total * n,
-        capacity=total * n,
-        chunk_steps=config.loop.chunk_steps,
-        vector_steps=total,
-        prefill=prefill * n,
-        updates=total - prefill,
         frames=frames,
     )
-    return training.Run(config, agent, loop, loop.shapes())  # type: ignore[arg-type]
+    return training.Run(config, agent, loop, loop.state_shapes())  # type: ignore[arg-type]
 
 
 def run() -> training.Run:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from experiments import evaluate, train, training
+from experiments import evaluate, train
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import envs, names, run_directory, settings
+from ne_dreamer_jax import envs, settings
+from ne_dreamer_jax.runs import run_directory, training
+from ne_dreamer_jax.settings import names
 from tests.experiments import stub
 
 

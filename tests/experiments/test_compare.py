@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from experiments import ablations, compare, plots
+from experiments import ablations, compare
 from experiments.train import configure
-from ne_dreamer_jax import metrics, names, run_directory
-from ne_dreamer_jax.metrics import Counters
+from ne_dreamer_jax.runs import metrics, plots, run_directory
+from ne_dreamer_jax.runs.metrics import StepCounts
+from ne_dreamer_jax.settings import names
 
 BUDGET = 400
 
@@ -21,7 +22,7 @@ def write(path, options, upto=BUDGET):
     with run_directory.claim(path, config) as files, metrics.Writer(files.metrics) as writer:
         for step in range(100, upto + 1, 100):
             more = {"eval/random_return": 7.0} if step == 100 else {}
-            writer.write(Counters(step, step // 2, 0), {"eval/return": step + seed, **more})
+            writer.write(StepCounts(step, step // 2, 0), {"eval/return": step + seed, **more})
 
 
 @pytest.fixture

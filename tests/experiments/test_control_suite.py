@@ -9,8 +9,8 @@ import pytest
 from dm_control import suite
 
 import ne_dreamer_jax as nedreamer
-from experiments import control_suite, evaluate
 from ne_dreamer_jax.config import EnvConfig
+from ne_dreamer_jax.runs import control_suite, evaluate
 from ne_dreamer_jax.types import PolicyState
 
 EPISODES = 2

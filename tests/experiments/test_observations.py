@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import training
 from ne_dreamer_jax.config import EnvConfig
+from ne_dreamer_jax.runs import training
 from tests.experiments import toy
 
 VECTORS = {"orientation": (2,), "velocity": (1,)}  # dm_control's, of the pendulum
@@ -41,8 +41,8 @@ def test_an_agent_learns_from_dm_controls_observations(obs):
     run = build(obs)
     state = run.loop.init(jax.random.key(0))
     before = jax.device_get(state.train.params["encoder"])
-    state, metrics = run.loop.chunk(state, jnp.asarray(run.loop.vector_steps, jnp.int32))
-    assert int(state.train.update) == run.loop.updates > 0
+    state, metrics = run.loop.chunk(state, jnp.asarray(run.loop.budget.vector_steps, jnp.int32))
+    assert int(state.train.update) == run.loop.budget.updates > 0
     assert all(np.isfinite(value) for name, value in metrics.items() if name not in ("return", "length"))
     for (path, old), new in zip(
         jax.tree.leaves_with_path(before), jax.tree.leaves(state.train.params["encoder"]), strict=True

@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from experiments import ablations, compare, evaluate, sweep, train
-from experiments.options import UserPath, as_argument, typed
+from ne_dreamer_jax.commands.options import UserPath
+from ne_dreamer_jax.runs.run_directory import as_argument, typed
 
 
 @click.command()
@@ -57,7 +58,7 @@ def test_a_path_comes_back_from_the_shell_and_the_next_command(name):
 def test_a_reader_that_has_gone_does_not_end_the_program(tmp_path):
     """With a line left in the buffer, and an exit code that is the program's own."""
     code = (
-        "import sys, time; from experiments.options import say\n"
+        "import sys, time; from ne_dreamer_jax.commands.options import say\n"
         "for _ in range(200): say('line ± ' + 1000 * '.'); time.sleep(0.001)\n"
         "open('reached', 'w').close(); raise SystemExit(7)"
     )
@@ -76,7 +77,7 @@ def test_a_reader_that_has_gone_does_not_end_the_program(tmp_path):
 
 @pytest.mark.parametrize("where", [">&-", "> /dev/full"])
 def test_a_program_without_a_place_to_print_to_goes_on(tmp_path, where):
-    code = "from experiments.options import say; say('x'); say('y'); raise SystemExit(7)"
+    code = "from ne_dreamer_jax.commands.options import say; say('x'); say('y'); raise SystemExit(7)"
     line = f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} {where}"
     done = subprocess.run(["sh", "-c", line], capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (7, b"")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import pages
+from ne_dreamer_jax.system import pages
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ["python", "-m", "experiments.train", "--settings"]

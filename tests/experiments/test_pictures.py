@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from experiments import pictures, plots, video
+from ne_dreamer_jax.runs import pictures, plots, video
 
 
 def lines(count):

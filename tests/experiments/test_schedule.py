@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments import progress
-from experiments.schedule import Schedule
-from experiments.stop import Stop
-from ne_dreamer_jax.metrics import Counters
+from ne_dreamer_jax.runs import progress
+from ne_dreamer_jax.runs.metrics import StepCounts
+from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.runs.signals import Stop
 
 schedules = st.builds(
     Schedule,
@@ -53,7 +53,7 @@ def test_durations_read_well(seconds, words):
 def test_the_time_left_counts_chunks_that_learned_and_evaluations_to_come():
     schedule = Schedule(total=100, chunk=10, evaluation=50, num_envs=2, action_repeat=2)
     pace = progress.Pace(schedule)
-    counters = [Counters(40 * n, 20 * n, max(0, n - 1)) for n in range(4)]
+    counters = [StepCounts(40 * n, 20 * n, max(0, n - 1)) for n in range(4)]
     first = pace.line(counters[0], counters[1], {}, seconds=1.0)
     assert first.split("  ") == [
         " 10.0 %",

@@ -7,8 +7,7 @@ import signal
 import numpy as np
 import pytest
 
-from experiments import training
-from ne_dreamer_jax import checkpoint, metrics, run_directory
+from ne_dreamer_jax.runs import checkpoint, metrics, run_directory, training
 from tests.experiments import stub, toy
 
 LAST = 120
@@ -75,7 +74,7 @@ def test_metrics_count_steps_updates_and_episodes(finished):
     assert all(line["train/faults"] == 0 for line in chunks)
     assert [line["env_step"] for line in chunks] == [16, 32, 48, 64, 80, 96, 112, 120]
     assert all(line["agent_step"] == line["env_step"] for line in lines)  # action repeat 1
-    assert chunks[-1]["update"] == stub.run().loop.updates == 50
+    assert chunks[-1]["update"] == stub.run().loop.budget.updates == 50
     assert [("train/loss/total" in line) for line in chunks] == [False] + 7 * [True]  # after the prefill of 20
     assert [("train/return" in line) for line in chunks] == 7 * [True] + [False]  # no episode ends in the last chunk
     assert all(np.isfinite(value) for line in lines for value in line.values())
@@ -265,4 +264,4 @@ def test_the_real_loop_goes_on_to_the_same_bits(tmp_path):
     assert train(tmp_path / "stopped", run=again)[0] == 0
     assert last_bits(tmp_path / "stopped") == last_bits(tmp_path / "straight")
     assert measured(tmp_path / "stopped") == measured(tmp_path / "straight")
-    assert measured(tmp_path / "straight")[-1]["update"] == run.loop.updates
+    assert measured(tmp_path / "straight")[-1]["update"] == run.loop.budget.updates

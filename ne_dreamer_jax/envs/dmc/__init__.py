@@ -15,7 +15,7 @@ from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.envs.dmc import environment
 from ne_dreamer_jax.envs.dmc.common import Task
 from ne_dreamer_jax.envs.dmc.simulation import Simulation
-from ne_dreamer_jax.numerics import in_32_bits
+from ne_dreamer_jax.system.numerics import in_32_bits
 
 __all__ = ["Simulation", "Task", "from_task", "load", "make"]
 

@@ -95,7 +95,11 @@ def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base
         return State(data, episode, steps_left), progress
 
     spec, observe, pictures = _make_observe(task, obs, image_size)
-    return base.Core(EnvSpec(spec, ContinuousAction(simulation.mj_model.nu)), reset, step, observe, pictures, blank)
+    env_spec, seconds = (
+        EnvSpec(spec, ContinuousAction(simulation.mj_model.nu)),
+        action_repeat * simulation.control_timestep,
+    )
+    return base.Core(env_spec, reset, step, observe, pictures, seconds, blank)
 
 
 def _check_numbers(task: Task) -> None:

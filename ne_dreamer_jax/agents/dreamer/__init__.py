@@ -1,0 +1,1 @@
+"""The world-model agent: `world_model` observes, `behavior` imagines, `agent` puts them together."""

@@ -1,0 +1,226 @@
+"""Learning behaviour in imagination: rollouts of the prior under the policy, actor and critic losses.
+
+States are indexed 0 .. H: state 0 is a replayed posterior, state t + 1 follows from the action at t. The reward and
+the continuation of state t + 1 were received on arrival at it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.losses import (
+    critic_loss,
+    dynamics_loss,
+    lambda_returns,
+    reinforce_loss,
+    return_scale,
+    symexp_bins,
+    twohot_mean,
+    update_percentiles,
+)
+from ne_dreamer_jax.nets.heads import model_action, policy
+from ne_dreamer_jax.nets.networks import Networks
+from ne_dreamer_jax.nets.rssm import RSSM, feature
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import NonNegative, Positive, Range, Share, ShareBelowOne
+from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
+
+LOSSES = ("actor", "critic", "replay_critic")
+
+
+Percentile = Annotated[float, Range(0.0, 100.0)]
+
+
+@dataclass(frozen=True)
+class BehaviorConfig:
+    """Settings of the actor-critic."""
+
+    horizon: Annotated[int, Range(1, 10_000)] = 15
+    """H, imagined steps."""
+    discount: ShareBelowOne = 0.997
+    """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
+    lam: Share = 0.95
+    """lambda of the returns."""
+    entropy: NonNegative = 3e-4
+    """eta, scale of the policy's entropy."""
+    gradient: Literal["reinforce", "dynamics"] = "reinforce"
+    """How the actor is trained: by the score function, or through the world model."""
+    slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
+    """Share of the critic that moves into the slow critic at each update."""
+    slow_scale: NonNegative = 1.0
+    """Weight of the critic's regularisation towards the slow critic."""
+    return_decay: ShareBelowOne = 0.99
+    """Decay of the moving percentiles of the returns."""
+    return_percentiles: tuple[Percentile, Percentile] = (5.0, 95.0)
+    """The returns are normalised by the range between these."""
+    return_floor: Positive = 1.0
+    """Returns are never divided by less."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        low, high = self.return_percentiles
+        if low >= high:
+            raise ValueError(f"behavior.return_percentiles: expected the first below the second, got {low} and {high}.")
+
+
+class Trajectory(NamedTuple):
+    """M imagined trajectories, and what was made of their states."""
+
+    seen: Any  # [H, M, ...], what ``look`` returned at the states 0 .. H - 1
+    last: Any  # [M, ...], and at state H
+    policy: Array  # float32 [H, M, outputs], the actor's outputs at all states but the last
+    action: Array  # float32 [H, M, A], raw samples: not clipped
+
+
+def imagine(
+    nets: Networks,
+    params: Params,
+    key: Array,
+    start: Latent,
+    horizon: int,
+    look: Callable[[Array], Any] = lambda state: state,
+    through_model: bool = False,
+) -> Trajectory:
+    """H steps of the prior under the policy from ``start`` [M, ...]; the models see clipped actions.
+
+    ``look`` is applied to each state's feature [M, F] while it is at hand: what heads make of it is small, and all
+    features of all states are not.
+
+    Gradients of ``policy`` reach the actor's parameters. Those of states and actions do so only where
+    ``through_model``; otherwise actions are constants, and the actor need not be run again for its loss.
+    """
+
+    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Any, Array, Array]]:
+        action_key, latent_key = jax.random.split(key)
+        state = feature(latent)
+        outputs = keep_products(nets.apply)("actor", params, state)
+        raw = policy(nets.heads, nets.spec.action, outputs).sample(action_key)
+        raw = raw if through_model else jax.lax.stop_gradient(raw)
+        uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
+        action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
+        after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
+        return after, (look(state), outputs, raw)
+
+    last, (seen, outputs, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
+    return Trajectory(seen, look(feature(last)), outputs, actions)
+
+
+def keep_products(apply: Callable[..., Any]) -> Callable[..., Any]:
+    """`Networks.apply` for a scan, of which matrix products alone are kept for the gradient.
+
+    What lies between them is computed again: less work than to write it for every step and to read it back. (Outside a
+    scan the compiler may keep more.)
+    """
+
+    def call(name: str, params: Params, x: Array) -> Array:
+        head = lambda params, x: apply(name, {name: params}, x)
+        return jax.checkpoint(head, policy=jax.checkpoint_policies.dots_saveable, prevent_cse=False)(params[name], x)
+
+    return call
+
+
+class Judgement(NamedTuple):
+    """What the heads say of states [...]."""
+
+    reward: Array  # float32 [...], received on arrival
+    discount: Array  # float32 [...], the probability of going on; it contains the discount
+    value: Array  # float32 [...]
+    logits: Array  # float32 [..., bins], the critic's
+    slow_value: Array  # float32 [...]
+    policy: Array | None  # float32 [..., outputs], the actor's with the state held fixed, where gradients pass states
+
+
+def actor_critic_losses(
+    nets: Networks,
+    config: BehaviorConfig,
+    params: Params,
+    slow_critic: Params,
+    scale: ReturnScale,
+    key: Array,
+    rollout: Rollout,
+) -> tuple[dict[str, Array], ReturnScale, Metrics]:
+    """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
+
+    The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
+    ``rollout.feature`` (DreamerV3).
+    """
+    frozen = jax.lax.stop_gradient(params)
+    through_model = config.gradient == "dynamics"
+    bins = symexp_bins(nets.heads.bins)
+    slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)
+
+    def judge(state: Array) -> Judgement:
+        apply = keep_products(nets.apply)
+        fixed = jax.lax.stop_gradient(state)
+        logits = apply("critic", params, fixed)
+        seen = state if through_model else fixed
+        return Judgement(
+            reward=twohot_mean(apply("reward", frozen, seen), bins),
+            # The head's probability already contains the discount (see world_model.prediction_losses).
+            discount=jax.nn.sigmoid(apply("continue", frozen, seen)[..., 0]),
+            value=twohot_mean(apply("critic", frozen, seen) if through_model else jax.lax.stop_gradient(logits), bins),
+            logits=logits,
+            slow_value=slow_value(fixed),
+            policy=apply("actor", params, fixed) if through_model else None,
+        )
+
+    acting = {**frozen, "actor": params["actor"]}
+    start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
+    imagined = imagine(nets, acting, key, start, config.horizon, judge, through_model)
+    seen, last = imagined.seen, imagined.last
+    of_all = lambda before, last: jnp.concatenate([before, last[None]]).T  # [M, H + 1]
+    reward, discount, value = (
+        of_all(seen.reward, last.reward),
+        of_all(seen.discount, last.discount),
+        of_all(seen.value, last.value),
+    )
+    returns = lambda_returns(reward, value, discount, config.lam)  # [M, H]
+    weight = jax.lax.stop_gradient(jnp.cumprod(discount, axis=1))[:, :-1]
+
+    scale = ReturnScale(
+        *update_percentiles(scale.low, scale.high, returns, config.return_decay, config.return_percentiles)
+    )
+    divisor = return_scale(scale.low, scale.high, config.return_floor)
+    # The entropy's gradient goes to the actor at its own state, never through the states before.
+    outputs = imagined.policy if seen.policy is None else seen.policy
+    distribution = policy(nets.heads, nets.spec.action, outputs)
+    entropy = distribution.entropy().T
+    if through_model:
+        actor = dynamics_loss(returns / divisor, entropy, weight, config.entropy)
+    else:
+        advantage = (returns - value[:, :-1]) / divisor
+        log_prob = distribution.log_prob(imagined.action).T
+        actor = reinforce_loss(log_prob, advantage, entropy, weight, config.entropy)
+
+    critic = critic_loss(seen.logits, returns.T, seen.slow_value, weight.T, bins, config.slow_scale)  # [H, M]
+    replay_critic = _replay_critic_loss(nets, config, params, slow_value, rollout, returns[:, 0])
+    losses = {"actor": jnp.mean(actor), "critic": jnp.mean(critic), "replay_critic": jnp.mean(replay_critic)}
+    metrics = {
+        "imagined/return": jnp.mean(returns),
+        "imagined/reward": jnp.mean(reward[:, 1:]),
+        "imagined/value": jnp.mean(value),
+        "imagined/return_scale": divisor,
+        "policy/entropy": jnp.mean(entropy),
+    }
+    return losses, scale, jax.lax.stop_gradient(metrics)
+
+
+def _replay_critic_loss(
+    nets: Networks, config: BehaviorConfig, params: Params, slow_value, rollout: Rollout, imagined_return: Array
+) -> Array:
+    """Critic loss [B, T - 1] on replayed rewards, bootstrapped by the imagined return from each state [B*T]."""
+    batch = rollout.batch
+    bootstrap = jax.lax.stop_gradient(imagined_return).reshape(batch.reward.shape)
+    discount = config.discount * (1 - batch.is_terminal.astype(jnp.float32))
+    returns = lambda_returns(batch.reward, bootstrap, discount, config.lam, batch.is_last)
+    bins = symexp_bins(nets.heads.bins)
+    logits = nets.apply("critic", params, rollout.feature[:, :-1])
+    slow = slow_value(jax.lax.stop_gradient(rollout.feature[:, :-1]))
+    # A last step has no return of its own: what follows it in the sequence is another episode.
+    weight = 1 - batch.is_last[:, :-1].astype(jnp.float32)
+    return critic_loss(logits, returns, slow, weight, bins, config.slow_scale)

@@ -1,0 +1,1 @@
+"""Commands: ``python -m ne_dreamer_jax train`` and the like."""

@@ -1,0 +1,53 @@
+"""N environments, stepped together: what the training loop and `loop.play` see of an environment.
+
+``jax.vmap`` of an `Env` is one way to get it (`vectorize`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from ne_dreamer_jax.envs.base import Env, Pictures
+from ne_dreamer_jax.types import Array, EnvSpec, TimeStep
+
+
+class Cuts(NamedTuple):
+    """Episodes that each environment has cut since it was prepared, int32 [N]."""
+
+    faults: Array  # because its simulation broke down
+    bad_actions: Array  # because an action was not finite
+
+
+class VectorEnv(NamedTuple):
+    """Pure functions of N environments at once; N is that of the arguments."""
+
+    spec: EnvSpec
+    """Of one environment."""
+    prepare: Callable[[Array], Any]
+    """typed keys [N] -> states from which the first ``step`` begins the episodes, whatever its actions."""
+    step: Callable[[Any, Array], tuple[Any, TimeStep]]
+    """(states, actions [N, ...]) -> new states and time steps [N, ...]; after ``is_last`` an episode begins anew."""
+    cuts: Callable[[Any], Cuts]
+    """states -> the episodes cut so far."""
+    pictures: Pictures | None = None
+    """How images can be drawn again: ``record`` of states [N], ``redraw`` of one record."""
+    step_seconds: float | None = None
+    """Simulated time of an agent step, where the environment has such."""
+
+
+def vectorize(env: Env) -> VectorEnv:
+    """N environments of one kind under ``jax.vmap``."""
+    pictures = env.pictures
+    if pictures is not None:
+        pictures = pictures._replace(record=jax.vmap(pictures.record))
+    return VectorEnv(
+        spec=env.spec,
+        prepare=jax.vmap(env.prepare),
+        step=jax.vmap(env.step),
+        cuts=lambda state: Cuts(state.faults, state.bad_actions),
+        pictures=pictures,
+        step_seconds=env.step_seconds,
+    )

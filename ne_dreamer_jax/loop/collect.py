@@ -1,0 +1,63 @@
+"""Step the environments, act, and store what was seen."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import jax.numpy as jnp
+
+from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.envs.vector import VectorEnv
+from ne_dreamer_jax.loop.state import Episodes, Finished, LoopState
+from ne_dreamer_jax.replay import ring
+from ne_dreamer_jax.replay.storage import Storage
+from ne_dreamer_jax.system import parallel
+from ne_dreamer_jax.types import Array, PolicyState, TimeStep, Transition
+
+TimeLimits = Literal["marked", "unmarked", "terminal"]
+
+
+def collect(
+    env: VectorEnv,
+    agent: Agent,
+    storage: Storage,
+    time_limits: TimeLimits,
+    state: LoopState,
+    finished: Finished,
+    key: Array,
+) -> tuple[LoopState, Finished]:
+    """One step of all N environments: with the actions chosen before, then new ones for what is seen now.
+
+    Args:
+      finished: sums over the episodes that ended so far, to be added to.
+      key: consumed, for the agent's samples.
+
+    Returns:
+      The state with one more row in replay, and the sums.
+    """
+    step_share = parallel.per_shard(env.step, (parallel.SPLIT, parallel.SPLIT), parallel.SPLIT)
+    env_state, timestep = step_share(state.env, state.policy.prev_action)
+    policy, action = agent.act(state.train.params, state.policy, timestep, key)
+    obs = storage.encode_obs(env_state, timestep.obs, ring.next_row(state.replay))
+    step = transition(time_limits, timestep._replace(obs=obs), policy, action)
+    replay = ring.add(state.replay, step)
+
+    ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
+    length = jnp.where(timestep.is_first, 0, state.episodes.length + 1)
+    ended = timestep.is_last
+    finished = Finished(
+        episodes=finished.episodes + jnp.sum(ended).astype(jnp.float32),
+        returns=finished.returns + jnp.sum(jnp.where(ended, ret, 0.0)),
+        lengths=finished.lengths + jnp.sum(jnp.where(ended, length, 0)).astype(jnp.float32),
+    )
+    return state._replace(env=env_state, policy=policy, replay=replay, episodes=Episodes(ret, length)), finished
+
+
+def transition(time_limits: TimeLimits, timestep: TimeStep, policy: PolicyState, action: Any) -> Transition:
+    """What replay holds of a step; ``time_limits`` as in `LoopConfig`."""
+    is_last, is_terminal = timestep.is_last, timestep.is_terminal
+    if time_limits == "unmarked":
+        is_last = is_terminal
+    if time_limits == "terminal":
+        is_terminal = is_last
+    return Transition(timestep.obs, action, timestep.reward, timestep.is_first, is_last, is_terminal, policy.latent)

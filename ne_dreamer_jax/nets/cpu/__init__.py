@@ -1,0 +1,1 @@
+"""Lowerings of convolutions for CPUs."""

@@ -1,0 +1,105 @@
+"""What a run leaves on disk as it goes: metrics and checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+
+from ne_dreamer_jax.runs import checkpoint
+from ne_dreamer_jax.runs import metrics
+from ne_dreamer_jax.system import parallel
+from ne_dreamer_jax.replay.host_frames import HostFrames
+from ne_dreamer_jax.loop import LoopState
+from ne_dreamer_jax.runs.metrics import StepCounts
+from ne_dreamer_jax.runs.run_directory import RunDirectory
+
+
+def whole(frames: HostFrames | None) -> tuple[str, ...]:
+    """The items of a checkpoint from which training goes on; ``frames`` are those of the loop."""
+    return ("agent", "loop") if frames is None else ("agent", "loop", "frames")
+
+
+class Record:
+    """The metrics of a run so far, on disk and at hand."""
+
+    def __init__(self, writer: metrics.Writer, lines: list[dict[str, Any]]) -> None:
+        self._writer = writer
+        self.lines = lines
+
+    def write(self, counters: StepCounts, values: Mapping[str, Any]) -> None:
+        """Adds a line."""
+        self._writer.write(counters, values)
+        self.lines.append(counters._asdict() | {name: float(value) for name, value in values.items()})
+
+    def find(self, name: str, counters: StepCounts | None = None) -> float | None:
+        """The last value of a name, at these counters where they are given."""
+        for line in reversed(self.lines):
+            if name in line and (counters is None or line["env_step"] == counters.env_step):
+                return line[name]
+        return None
+
+    def score(self, counters: StepCounts) -> float | None:
+        """What ranks the checkpoint at these counters: the return of its evaluation.
+
+        None where there was none, where an episode was cut short, or where parameters are not finite.
+        """
+        sound = self.find("eval/cut_episodes", counters) == 0 and self.find("eval/finite", counters) == 1
+        return self.find("eval/return", counters) if sound else None
+
+    @property
+    def random_return(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of a random policy's returns."""
+        mean, deviation = self.find("eval/random_return"), self.find("eval/random_return_std")
+        return None if mean is None or deviation is None else (mean, deviation)
+
+
+class Saves:
+    """Checkpoints: whole ones in intervals of time, and the agent alone where an evaluation is the best so far."""
+
+    def __init__(
+        self, files: RunDirectory, seconds: float, echo: Callable[[str], None], frames: HostFrames | None = None
+    ) -> None:
+        self._directory, self._seconds, self._echo = files.checkpoints, seconds, echo
+        self._frames, self._items = frames, whole(frames)
+        self._last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether the interval is over."""
+        return bool(parallel.agreed(time.monotonic() - self._last >= self._seconds)[0])
+
+    def whole(self, state: LoopState, counters: StepCounts, score: float | None) -> None:
+        """Saves everything, unless it stands there already."""
+        if parallel.agreed(not any(found.score == score for found in self._whole_at(counters)))[0]:
+            rest: Any = ()
+            items: dict[str, Any] = {"agent": state.train, "loop": state._replace(train=rest)}
+            if self._frames is not None:
+                items["frames"] = self._frames.arrays
+            self._save(items, counters, score)
+        self._last = time.monotonic()
+
+    def if_best(self, state: LoopState, counters: StepCounts, score: float | None) -> None:
+        """Saves the agent if no checkpoint has as high a score; one without a score is not the best."""
+        best = checkpoint.best(checkpoint.checkpoints(self._directory))
+        beaten = score is not None and (best is None or best.score is None or score > best.score)
+        stopped_here, saves = parallel.agreed(bool(self._whole_at(counters)), beaten)
+        if stopped_here:  # before this evaluation
+            self.whole(state, counters, score)
+        elif saves:
+            self._save({"agent": state.train}, counters, score)
+
+    def _whole_at(self, counters: StepCounts) -> list[checkpoint.Checkpoint]:
+        found = checkpoint.checkpoints(self._directory)
+        return [entry for entry in found if entry.step == counters.env_step and set(self._items) <= set(entry.items)]
+
+    def _save(self, items: dict[str, Any], counters: StepCounts, score: float | None) -> None:
+        began = time.monotonic()
+        if jax.process_count() > 1:
+            items = parallel.gather(items)
+            if jax.process_index() > 0:
+                return
+        checkpoint.save(self._directory, counters.env_step, items, score=score, notes=counters._asdict())
+        checkpoint.prune(self._directory, whole=self._items)
+        self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

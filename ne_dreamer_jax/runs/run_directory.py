@@ -1,0 +1,189 @@
+"""The directory of one run, which belongs to that run alone.
+
+=====================  ==================================================================
+``.ne_dreamer_jax``    the marker that says so; locked while a process trains here
+``config.json``        the configuration, whole
+``metrics.jsonl``      see `ne_dreamer_jax.metrics`
+``checkpoints/``       see `ne_dreamer_jax.checkpoint`
+``evaluation.json``    what the last evaluation found
+``curve.png``          learning curves
+``policy.mp4``         one evaluation episode
+=====================  ==================================================================
+
+The same configuration on the same directory goes on; another one, and a directory with anything else in it, is
+refused, so that nothing is ever overwritten but by the run that wrote it. Standard library only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from ne_dreamer_jax import settings
+
+C = TypeVar("C")
+MARKER = ".ne_dreamer_jax"
+_MARKER_TEXT = "A run directory of ne_dreamer_jax. The same command on this directory goes on with the run.\n"
+
+
+class RefusedError(Exception):
+    """The directory can't be used for this run; the message says why and what to do."""
+
+
+class RunDirectory(NamedTuple):
+    """Where the files of a run lie."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """The configuration as JSON."""
+        return self.path / "config.json"
+
+    @property
+    def metrics(self) -> Path:
+        """Metrics, one JSON object a line."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def evaluation(self) -> Path:
+        """Result of the last evaluation as JSON."""
+        return self.path / "evaluation.json"
+
+    @property
+    def curve(self) -> Path:
+        """Learning curves."""
+        return self.path / "curve.png"
+
+    @property
+    def video(self) -> Path:
+        """One evaluation episode."""
+        return self.path / "policy.mp4"
+
+    @property
+    def marker(self) -> Path:
+        """What says that the directory is ours."""
+        return self.path / MARKER
+
+
+def as_argument(path: Path) -> str:
+    """The path as a command takes it for the same; ``-x`` and ``~`` may be names of folders."""
+    text = str(path)
+    return f"./{text}" if text.startswith(("-", "~")) else text
+
+
+def typed(path: Path) -> str:
+    """The path as it is typed in a shell."""
+    return shlex.quote(as_argument(path))
+
+
+def check(path: Path) -> None:
+    """Refuses a path that can't be a run directory, whatever the configuration; touches nothing.
+
+    Raises:
+      RefusedError: it is a file, a directory that holds something else, or nowhere that could be read and written.
+    """
+    try:
+        if path.exists() and not path.is_dir():
+            raise RefusedError(f"expected a directory, got a file: {path}. Choose another --logdir")
+        contents = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
+        nearest = next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))
+    except OSError as error:
+        raise RefusedError(f"{path} can't be made a run directory: {error}. Choose another --logdir") from error
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise RefusedError(
+            f"{path} can't be made a run directory: expected {nearest} to be one that can be written to. "
+            "Choose another --logdir"
+        )
+    if contents and MARKER not in contents:
+        shown = ", ".join(contents[:3] + (["..."] if len(contents) > 3 else []))
+        raise RefusedError(
+            f"{path} holds something that is not a run ({shown}). "
+            "Nothing was touched; choose an empty directory or a new one"
+        )
+
+
+def check_same(path: Path, config: Any) -> None:
+    """Refuses a directory that holds a run of another configuration; touches nothing.
+
+    Raises:
+      RefusedError: what differs, one line each.
+    """
+    if not RunDirectory(path).config.exists():
+        return
+    different = settings.differences(read_config(path, type(config)), config)
+    if different:
+        shown = [*different[:8], *([f"and {len(different) - 8} more"] if len(different) > 8 else [])]
+        raise RefusedError(
+            f"{path} holds another run. Give it the same options to go on, or choose another --logdir. "
+            "They differ in\n  " + "\n  ".join(shown)
+        )
+
+
+@contextlib.contextmanager
+def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
+    """Holds a run directory for training, made if need be; nobody else gets it meanwhile.
+
+    Args:
+      config: a frozen dataclass (see `ne_dreamer_jax.settings`): everything that decides what the run computes.
+
+    Raises:
+      RefusedError: as `check` says, or it holds a run of another configuration, or a process trains in it.
+    """
+    check(path)
+    files = RunDirectory(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        marker = files.marker.open("a+", encoding="utf-8")
+    except OSError as error:
+        raise RefusedError(f"{path} can't be made a run directory: {error}") from error
+    with marker:
+        try:
+            fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RefusedError(f"another process trains in {path}. Wait for it, or choose another --logdir") from None
+        check_same(path, config)
+        if not files.config.exists():
+            marker.write(_MARKER_TEXT)
+            marker.flush()
+            _write_json(files.config, settings.to_dict(config))
+        yield files
+
+
+def read_config(path: Path, cls: type[C]) -> C:
+    """The configuration of a run.
+
+    Raises:
+      RefusedError: there is no run, or its configuration is of another version of this program.
+    """
+    files = RunDirectory(path)
+    if not files.marker.exists() or not files.config.exists():
+        raise RefusedError(f"expected a run directory, with {MARKER} and config.json in it, got {path}")
+    try:
+        return settings.from_dict(cls, json.loads(files.config.read_text(encoding="utf-8")))
+    except ValueError as error:
+        raise RefusedError(
+            f"{files.config} does not fit this version of the program, or was edited by hand: {error}"
+        ) from error
+
+
+def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:
+    """Stores what an evaluation found, in place of the one before."""
+    _write_json(files.evaluation, result)
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    beside = path.with_name(path.name + ".partial")
+    beside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    os.replace(beside, path)

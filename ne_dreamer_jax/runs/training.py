@@ -1,0 +1,284 @@
+"""A training run from its start, or from where it was stopped, to its end.
+
+The host's part of the loop: it compiles the chunk, calls it, writes metrics and checkpoints, evaluates, and draws the
+pictures. What a run computes depends on its configuration alone: not on how often it was stopped, nor on when
+checkpoints were written.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+import ne_dreamer_jax as nedreamer
+from ne_dreamer_jax.runs import pictures
+from ne_dreamer_jax.runs import plots
+from ne_dreamer_jax.runs import progress
+from ne_dreamer_jax.runs import video
+from ne_dreamer_jax.runs.run_directory import typed
+from ne_dreamer_jax.runs.record import Record, Saves, whole
+from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.runs.signals import Stop
+from ne_dreamer_jax.runs import checkpoint
+from ne_dreamer_jax.system import compile_cache
+from ne_dreamer_jax.runs import metrics
+from ne_dreamer_jax.system import parallel
+from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs.base import Env
+from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
+from ne_dreamer_jax.runs.metrics import StepCounts
+from ne_dreamer_jax.runs.run_directory import RunDirectory
+
+Echo = Callable[[str], None]
+FRAMES_PER_SECOND = 30.0  # of videos; environments differ in how much time a step stands for
+
+
+class Run(NamedTuple):
+    """A configuration made real."""
+
+    config: Config
+    agent: Agent
+    loop: Loop
+    shapes: LoopState  # shapes and dtypes of the whole state
+
+
+def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> Run:
+    """Makes the environment, the agent and the loop of a configuration; allocates nothing.
+
+    Args:
+      env: what to train in, instead of the environment that the configuration names.
+      mesh: of `ne_dreamer_jax.parallel`, to train on several devices.
+
+    Raises:
+      ValueError: what does not fit together, or not into memory.
+    """
+    options = config.env
+    env = env or nedreamer.envs.make(
+        options.task,
+        obs=options.obs,
+        action_repeat=options.action_repeat,
+        image_size=options.image_size,
+        fast=options.fast,
+    )
+    agent = nedreamer.make_agent(config.agent, env.spec)
+    loop = loops.make(config.loop, env, agent, options.action_repeat, mesh)
+    return Run(config, agent, loop, loop.state_shapes())
+
+
+def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
+    """Trains to the end of the budget, from the newest checkpoint if there is one.
+
+    Where a run has several processes, all of them call this. The first alone writes files, and what hangs on a clock, a
+    signal or a file is decided there.
+
+    Args:
+      files: of a directory that is claimed for this configuration; all processes must see the same.
+      checkpoint_minutes: time between checkpoints.
+      echo: takes the lines for people.
+
+    Returns:
+      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one.
+
+    Raises:
+      ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
+    """
+    schedule = Schedule.of(run.config, run.loop)
+    start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
+    state, lines = _start(run, files, start_key, echo)
+    counters = schedule.counters(state)
+    pace = progress.Pace(schedule)
+    saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
+    chunk: Any = None
+    frames = None
+    first = jax.process_index() == 0
+    with metrics.Writer(files.metrics if first else Path(os.devnull)) as writer, Stop(echo) as stop:
+        record = Record(writer, lines)
+        while True:
+            step = counters.agent_step // schedule.num_envs
+            missing, with_random = parallel.agreed(
+                record.find("eval/return", counters) is None, record.random_return is None
+            )
+            if schedule.evaluates(step) and missing:
+                values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
+                pace.evaluated(values["time/evaluation_seconds"])
+                record.write(counters, values)
+                if first:
+                    draw(run, files, record, echo)
+                if step < schedule.total:  # at the end everything is saved below
+                    saves.if_best(state, counters, record.score(counters))
+            (stopped_by,) = parallel.agreed(stop.signal or 0)
+            if step == schedule.total or stopped_by:
+                break
+            if chunk is None:
+                chunk = _compile(run, state, echo)
+            steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
+            began = time.perf_counter()
+            state, report = chunk(state, steps)
+            report = jax.device_get(report)
+            seconds = time.perf_counter() - began
+            before, counters = counters, schedule.counters(state)
+            values = _named(report, before, counters, seconds)
+            record.write(counters, values)
+            echo(pace.line(before, counters, values, seconds))
+            if saves.due():
+                saves.whole(state, counters, record.score(counters))
+        saves.whole(state, counters, record.score(counters))
+        if step < schedule.total:
+            echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
+            return 128 + stopped_by
+    if not first:
+        return 0
+    checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
+    if "image" in run.agent.spec.observation and not files.video.exists():
+        if frames is None:  # the run was stopped between its last evaluation and here
+            frames = evaluate(run, state, evaluation_key, False, echo)[1]
+        pictures.attempt(lambda: video.write(frames, files.video, fps=FRAMES_PER_SECOND), files.video, echo)
+    draw(run, files, record, echo)
+    for line in _conclusion(run, files, record):
+        echo(line)
+    return 0
+
+
+def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo) -> tuple[dict[str, float], Any]:
+    """Metrics of an evaluation on environments of its own, and the frames of one of its episodes.
+
+    Args:
+      key: of the run's evaluations; every step has its own episodes.
+      with_random: whether to evaluate a random policy too.
+    """
+    policy_key, random_key = jax.random.split(jax.random.fold_in(key, int(state.counters.vector_step)))
+    values: dict[str, float] = {}
+    if with_random:
+        echo("Compiling the evaluation, and playing episodes with a random policy.")
+        values |= _returns(run.loop.evaluate(state.train.params, random_key, random=True, frames=True), "eval/random_")
+    began = time.perf_counter()
+    evaluation = run.loop.evaluate(state.train.params, policy_key, frames=True)
+    values |= _returns(evaluation, "eval/")
+    values["time/evaluation_seconds"] = seconds = time.perf_counter() - began
+    values["eval/cut_episodes"] = cut = int((~np.asarray(evaluation.complete)).sum())
+    values["eval/finite"] = finite = bool(_finite(state.train.params))
+    echo(
+        f"Evaluation: return {values['eval/return']:.1f} ± {values['eval/return_std']:.1f} over "
+        f"{len(evaluation.returns)} episodes, in {progress.duration(seconds)}."
+    )
+    if not finite:
+        echo("The agent has diverged: some of its parameters are not finite. It is not kept as the best.")
+    elif cut:
+        echo(f"{cut} of the episodes were cut short by broken physics, so that this agent is not kept as the best.")
+    return values, evaluation.frames
+
+
+def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
+    """Draws the learning curve so far, if that can be."""
+    config = run.config
+    parameters = sum(parameter_counts(run.shapes.train.params).values())
+    title = f"{config.env.task}, {config.method}, {parameters / 1e6:.1f}M parameters, seed {config.seed}"
+    steps, random_return = config.loop.env_steps, record.random_return
+    pictures.attempt(
+        lambda: plots.learning_curve(
+            record.lines, files.curve, title=title, env_steps=steps, random_return=random_return
+        ),
+        files.curve,
+        echo,
+    )
+
+
+def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
+    """The state to go on from, and the metrics up to it."""
+    shapes, first = run.shapes, jax.process_index() == 0
+    if jax.process_count() > 1:  # each reads the whole and keeps its share
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
+    apart: Any = ()
+    like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=apart)}
+    if run.loop.frames is not None:
+        like["frames"] = run.loop.frames.shapes
+    began = time.perf_counter()
+    try:
+        restored = checkpoint.restore(files.checkpoints, like)
+    except FileNotFoundError:
+        _same_for_all(files, -1)
+        state = jax.block_until_ready(run.loop.init(key))
+        echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
+        return state, metrics.resume(files.metrics, -1) if first else []
+    for reason in restored.skipped:
+        echo(f"Passed over a damaged checkpoint: {reason}")
+    env_step = restored.checkpoint.step
+    echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
+    _same_for_all(files, env_step)
+    if run.loop.frames is not None:
+        run.loop.frames.load(restored.items["frames"])
+    state = restored.items["loop"]._replace(train=restored.items["agent"])
+    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if first else []
+
+
+def _same_for_all(files: RunDirectory, env_step: int) -> None:
+    if parallel.agreed(env_step) != (env_step,):
+        raise ValueError(
+            f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
+            f"{jax.process_index()}; put --logdir where all of them see it"
+        )
+
+
+def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
+    draws = "and draw " if "image" in run.agent.spec.observation else ""
+    echo(f"Compiling the training chunk: act, step {draws}the environments, store, sample, update.")
+    jitted: Any = run.loop.chunk
+    began = time.perf_counter()
+    lowered = jitted.lower(state, jnp.zeros((), jnp.int32))
+    traced = time.perf_counter()
+    with compile_cache.hits() as hits:
+        compiled = lowered.compile()
+    done = time.perf_counter()
+    how = "loaded from the cache" if hits else "compiled"
+    echo(f"Traced in {traced - began:.1f} s, {how} in {done - traced:.1f} s.")
+    return compiled
+
+
+@jax.jit
+def _finite(params: Any) -> jax.Array:
+    """Whether all parameters are finite numbers."""
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(params)]).all()
+
+
+def _named(report: Report, before: StepCounts, after: StepCounts, seconds: float) -> dict[str, float]:
+    """A chunk's metrics under their names."""
+    rates = {
+        "time/chunk_seconds": seconds,
+        "time/env_steps_per_second": (after.env_step - before.env_step) / seconds,
+        "time/updates_per_second": (after.update - before.update) / seconds,
+    }
+    return {f"train/{name}": value for name, value in report.means().items()} | rates
+
+
+def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
+    returns = np.asarray(evaluation.returns, np.float64)
+    return {f"{prefix}return": float(returns.mean()), f"{prefix}return_std": float(returns.std())}
+
+
+def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
+    mean, deviation = record.find("eval/return"), record.find("eval/return_std")
+    lines = [f"Finished {run.config.loop.env_steps:,} environment steps of {run.config.env.task}."]
+    if run.loop.budget.updates == 0:
+        lines.append(progress.NOTHING_LEARNED)
+    if mean is not None and deviation is not None and record.random_return is not None:
+        lines.append(
+            f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "
+            f"{record.random_return[0]:.1f} ± {record.random_return[1]:.1f}."
+        )
+    if files.curve.exists():
+        lines.append(f"  {files.curve}: the learning curve")
+    if files.video.exists():
+        lines.append(f"  {files.video}: an episode of the policy")
+    lines.append(f"  python -m ne_dreamer_jax evaluate {typed(files.path)}: more episodes")
+    return lines
