@@ -12,8 +12,9 @@ from typing import Any
 
 import click
 
-from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.commands.options import Name, refusing
 from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.quiet import quiet
 
 _BYTES = {"pred": 1, "u8": 1, "s8": 1, "bf16": 2, "f16": 2, "u16": 2, "f32": 4, "s32": 4, "u32": 4, "f64": 8}
 _COLLECTIVE = re.compile(

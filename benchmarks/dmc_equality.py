@@ -25,6 +25,7 @@ from scipy import stats
 
 from ne_dreamer_jax.envs import base, dmc, registry
 from ne_dreamer_jax.envs.dmc import Task, environment
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.envs.dmc.common import Episode
 
 Arrays = dict[str, np.ndarray]
@@ -48,18 +49,18 @@ def load_dm_control(name: str, seed: int) -> Any:
     """dm_control's own environment of that name."""
     from dm_control import suite
 
-    return suite.load(*registry.split_dmc(name), task_kwargs={"random": seed})
+    return suite.load(*dmc_names.split(name), task_kwargs={"random": seed})
 
 
 def load_task(name: str, fast: bool = False) -> Task:
     """Ours, as it is or with the shorter line search."""
-    task = dmc.load(*registry.split_dmc(name))
+    task = dmc.load(*dmc_names.split(name))
     return task._replace(simulation=task.simulation.fast()) if fast else task
 
 
 def drawn_episode(name: str, physics: Any) -> Any:
     """What dm_control's task has written into its model for this episode, as our task keeps it."""
-    domain, task = registry.split_dmc(name)
+    domain, task = dmc_names.split(name)
     if domain == "reacher":
         return np.array(physics.named.model.geom_pos["target", :2])
     if domain == "finger" and task != "spin":

@@ -9,9 +9,10 @@ from typing import Any
 import click
 
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.commands.options import Name, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
+from ne_dreamer_jax.system.quiet import quiet
 
 PARTS = ("environment", "rendering", "acting", "replay", "learning")
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
-from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.commands.options import Name, refusing
 from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.quiet import quiet
 
 FRAMES = 5_000_000  # the paper's replay
 

@@ -8,9 +8,10 @@ from typing import Any
 import click
 
 from benchmarks import common
-from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.commands.options import Name, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
+from ne_dreamer_jax.system.quiet import quiet
 
 METHODS = tuple(name for name in names.METHODS if "/" not in name)
 
@@ -66,7 +67,7 @@ def _make(size: str, method: str, actions: int) -> Any:
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     config = configure("dmc", size, method, {})
-    side = config.env.image_size
+    side = getattr(config.env, "image_size", 64)
     spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
     return make_agent(config.agent, spec)
 

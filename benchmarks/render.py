@@ -15,7 +15,8 @@ from typing import Any
 import click
 
 from benchmarks import mujoco_pictures
-from ne_dreamer_jax.commands.options import UserPath, quiet
+from ne_dreamer_jax.commands.options import UserPath
+from ne_dreamer_jax.system.quiet import quiet
 
 _STORED = pathlib.Path(__file__).parents[1] / "tests" / "render" / "references.npz"
 

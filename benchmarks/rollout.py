@@ -8,7 +8,9 @@ from typing import Any
 import click
 
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, quiet
+from ne_dreamer_jax.commands.options import Name
+from ne_dreamer_jax.envs.dmc import names as dmc_names
+from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -102,9 +104,9 @@ def _mjx_steps(task: str, num_envs: int, action_repeat: int, steps: int) -> Call
     import jax.numpy as jnp
     from mujoco import mjx
 
-    from ne_dreamer_jax.envs import dmc, registry
+    from ne_dreamer_jax.envs import dmc
 
-    simulation = dmc.load(*registry.split_dmc(task)).simulation
+    simulation = dmc.load(*dmc_names.split(task)).simulation
 
     def run(data: Any, key: jax.Array) -> Any:
         def step(data: Any, key: jax.Array) -> tuple[Any, Any]:

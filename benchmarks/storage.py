@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ne_dreamer_jax.commands.options import quiet
+from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})

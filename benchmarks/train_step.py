@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
-from ne_dreamer_jax.commands.options import Name, quiet, refusing
+from ne_dreamer_jax.commands.options import Name, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
+from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, UserPath, quiet, refusing, say
+from ne_dreamer_jax.commands.options import Name, UserPath, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
+from ne_dreamer_jax.system.quiet import quiet
 
 if TYPE_CHECKING:
     import numpy as np

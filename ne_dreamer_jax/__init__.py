@@ -7,9 +7,22 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["agents", "config", "envs", "loop", "losses", "objectives", "render", "replay", "settings", "types"],
+    submodules=[
+        "agents",
+        "config",
+        "envs",
+        "loop",
+        "losses",
+        "objectives",
+        "render",
+        "replay",
+        "runs",
+        "settings",
+        "types",
+    ],
     submod_attrs={
         "agents": ["Agent", "AgentConfig", "make_agent"],
-        "runs": ["checkpoint", "metrics", "run_directory"],
+        "envs": ["register"],
+        "runs": ["checkpoint", "evaluate", "load", "metrics", "run_directory", "train"],
     },
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from ne_dreamer_jax import settings
 from ne_dreamer_jax.agents import drqv2
@@ -17,6 +17,8 @@ from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
 from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
 from ne_dreamer_jax.agents.optim import OptimizerConfig
+from ne_dreamer_jax.envs import config as env_configs
+from ne_dreamer_jax.envs.config import DmcConfig, EnvConfig
 from ne_dreamer_jax.loop import budget
 from ne_dreamer_jax.loop.config import LoopConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
@@ -40,28 +42,10 @@ SIZES: dict[str, dict[str, int]] = {
 
 
 @dataclass(frozen=True)
-class EnvConfig:
-    """Which environment, and how it is observed."""
-
-    task: str = "dmc/walker_walk"
-    obs: Literal["pixels", "vector", "both"] = "pixels"
-    """pixels, vector or both."""
-    action_repeat: Annotated[int, Range(1, 1_000_000)] = 2
-    """Environment steps for which each action is held; rewards are summed."""
-    image_size: Annotated[int, Range(1, 4_096)] = 64
-    """Height and width of the frames."""
-    fast: bool = False
-    """Whether contacts are solved with a shorter line search than MuJoCo's; benchmarks/DMC.md measures the error."""
-
-    def __post_init__(self) -> None:
-        ranges.check(self)
-
-
-@dataclass(frozen=True)
 class Config:
     """An experiment."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=DmcConfig)
     agent: AgentConfig | DrQv2Config = field(default_factory=AgentConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     seed: Annotated[int, Range(0, LARGEST)] = 0
@@ -115,7 +99,7 @@ def quickstart(size: str) -> Config:
     loop = LoopConfig(
         env_steps=20_000, num_envs=8, replay_ratio=96.0, prefill=1_000, eval_every=5_000, eval_episodes=10
     )
-    return Config(EnvConfig("dmc/cheetah_run", image_size=32), agent, loop)
+    return Config(DmcConfig("dmc/cheetah_run", image_size=32), agent, loop)
 
 
 def smoke(size: str) -> Config:
@@ -124,7 +108,7 @@ def smoke(size: str) -> Config:
     loop = LoopConfig(
         env_steps=4_400, num_envs=4, replay_ratio=2.0, prefill=400, chunk_steps=50, eval_every=2_200, eval_episodes=1
     )
-    return Config(EnvConfig("dmc/cartpole_balance"), agent, loop)
+    return Config(DmcConfig("dmc/cartpole_balance"), agent, loop)
 
 
 def released_code(size: str) -> Config:
@@ -178,7 +162,14 @@ def with_method(config: Config, method: str) -> Config:
 
 
 def override(config: Config, assignment: str) -> Config:
-    """`settings.override`; another objective (``agent.objective=SameStep``) brings the weights of its losses along."""
+    """`settings.override`, where what hangs together stays together.
+
+    Another objective (``agent.objective=SameStep``) brings the weights of its losses along, and a task of another
+    family (``env.task=...``) that family's settings.
+    """
+    path, _, task = assignment.partition("=")
+    if path.strip() == "env.task":
+        return replace(config, env=env_configs.for_task(task.strip(), config.env))
     changed = settings.override(config, assignment)
     old, new = config.agent, changed.agent
     if isinstance(old, DrQv2Config) or isinstance(new, DrQv2Config) or type(old.objective) is type(new.objective):
@@ -193,7 +184,8 @@ def _with_objective(config: Config, agent: AgentConfig, objective: AnyObjective)
 
 
 def _drqv2(config: Config, shared: AgentConfig) -> Config:
-    published, env, loop = drqv2.for_task(config.env.task), config.env, config.loop
+    env, loop = config.env, config.loop
+    published = drqv2.for_task(env.task) if isinstance(env, DmcConfig) else DrQv2Config()
     every = budget.steps_per_update(shared.batch_size, shared.batch_length, loop.replay_ratio)
     agent = replace(
         published,
@@ -201,14 +193,15 @@ def _drqv2(config: Config, shared: AgentConfig) -> Config:
         steps_per_update=every,
         random_steps=min(loop.prefill, drqv2.SEED_FRAMES // env.action_repeat),
     )
-    image_size = drqv2.IMAGE_SIZE if env.image_size == EnvConfig.image_size else env.image_size
+    if isinstance(env, DmcConfig) and env.image_size == DmcConfig.image_size:
+        env = replace(env, image_size=drqv2.IMAGE_SIZE)
     loop = replace(
         loop,
         replay_ratio=budget.replay_ratio(agent.batch_size, agent.batch_length, every),
         prefill=agent.random_steps,
         write_latents=False,
     )
-    return replace(config, env=replace(env, image_size=image_size), agent=agent, loop=loop)
+    return replace(config, env=env, agent=agent, loop=loop)
 
 
 def _next_embedding(objective: AnyObjective, **predictor: Any) -> NextEmbedding:

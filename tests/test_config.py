@@ -10,18 +10,20 @@ import jax.numpy as jnp
 import pytest
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import envs, make_agent, objectives
+from ne_dreamer_jax import envs, make_agent, objectives, settings
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.agents import drqv2, optim
 from ne_dreamer_jax.agents.dreamer import world_model
 from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
-from ne_dreamer_jax.config import Config, EnvConfig, names, settings
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.runs import training
 from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout, TimeStep
 from tests import counting, tiny
 from tests.drqv2 import small
@@ -34,7 +36,7 @@ def test_commands_know_the_names_without_loading_the_registries():
     assert (*configs.METHODS, "drqv2") == names.METHODS
     assert tuple(configs.PRESETS) == names.PRESETS
     assert tuple(configs.SIZES) == names.SIZES
-    assert typing.get_args(typing.get_type_hints(EnvConfig)["obs"]) == names.OBSERVATIONS
+    assert typing.get_args(typing.get_type_hints(DmcConfig)["obs"]) == names.OBSERVATIONS
 
 
 @pytest.mark.parametrize("name", names.PRESETS)
@@ -513,7 +515,7 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
 
     monkeypatch.setattr(envs, "make", make)
     changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48", "fast": "true"}
-    assert set(changes) == {field.name for field in fields(EnvConfig)}
+    assert set(changes) == {field.name for field in fields(DmcConfig)}
     base = training.build(BASE).loop
     for name, value in changes.items():
         run = training.build(configs.override(BASE, f"env.{name}={value}"))

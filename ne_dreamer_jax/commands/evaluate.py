@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import ctypes.util
-import functools
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
 from ne_dreamer_jax import settings
-from ne_dreamer_jax.commands.options import UserPath, find_devices, quiet, refusing, say
+from ne_dreamer_jax.commands.options import UserPath, find_devices, refusing, say
 from ne_dreamer_jax.runs import run_directory
+from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -59,63 +58,39 @@ def main(
     if backend == "dm_control":
         with refusing(ValueError):
             allow_opengl()
-    import jax
-    import numpy as np
-
-    from ne_dreamer_jax.config import Config
-    from ne_dreamer_jax.runs import checkpoint, pictures, training, video
+    from ne_dreamer_jax.runs import checkpoint, evaluation
     from ne_dreamer_jax.system import compile_cache
 
     compile_cache.enable()
-    files = run_directory.RunDirectory(logdir)
-    with refusing(run_directory.RefusedError, ValueError):
+    options: dict[str, Any] = {"episodes": episodes, "prefer": prefer, "seed": seed, "with_video": with_video}
+    with refusing(run_directory.RefusedError, FileNotFoundError, checkpoint.DamagedError, ValueError):
         find_devices()
-        config = run_directory.read_config(logdir, Config)
-        if backend == "dm_control" and not config.env.task.startswith("dmc/"):
-            raise ValueError(f"--backend dm_control: expected a run of a dmc task, got one of {config.env.task}")
-        # The smallest replay there is: none is read or allocated here, and the run's may not fit this machine.
-        smallest = (config.agent.batch_length + 1) * config.loop.num_envs
-        run = training.build(replace(config, loop=replace(config.loop, capacity=smallest)))
-    with refusing(FileNotFoundError, checkpoint.DamagedError, ValueError):
-        restored = checkpoint.restore(files.checkpoints, {"agent": run.shapes.train}, prefer=prefer)
-    for reason in restored.skipped:
-        say(f"Passed over a damaged checkpoint: {reason}")
-    env_step = restored.checkpoint.step
-    say(f"{config.env.task}, {config.method}, after {env_step:,} environment steps ({restored.checkpoint.path})")
+        if backend == "mjx":
+            evaluation.evaluate(logdir, None, echo=say, **options)
+            return
+    _in_both(logdir, options)
 
-    params = restored.items["agent"].params
-    policy_key, random_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), EVALUATION))
-    evaluate = {"mjx": functools.partial(run.loop.evaluate, params, episodes=episodes, frames=True)}
-    if backend == "dm_control":
-        from ne_dreamer_jax.runs import control_suite
 
-        evaluate[backend] = functools.partial(control_suite.evaluate, config.env, run.agent, params, episodes=episodes)
-    content: dict[str, Any] = {"task": config.env.task, "env_step": env_step, "episodes": episodes, "seed": seed}
-    for place, play in evaluate.items():
-        results = {}
-        for name, key in (("policy", policy_key), ("random", random_key)):
-            with refusing(RuntimeError):
-                evaluation = play(key=key, random=name == "random")
-            returns = np.asarray(evaluation.returns, np.float64)
-            results[name] = {
-                "mean": float(returns.mean()),
-                "std": float(returns.std()),
-                "returns": [float(value) for value in returns],
-                "lengths": [int(value) for value in evaluation.lengths],
-            }
-            where = f" in {place}" if len(evaluate) > 1 else ""
-            say(f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {episodes} episodes{where}")
-            if place == "mjx" and name == "policy" and with_video:
-                if evaluation.frames is None:
-                    say("no video: this agent sees vectors, not pixels")
-                else:
-                    write = functools.partial(
-                        video.write, evaluation.frames, files.video, fps=training.FRAMES_PER_SECOND
-                    )
-                    if pictures.attempt(write, files.video, say):
-                        say(f"{files.video} shows the first episode")
-        content |= results if place == "mjx" else {place: results}
-    run_directory.write_evaluation(files, content)
+def _in_both(logdir: Path, options: dict[str, Any]) -> None:
+    """Plays in dm_control, too."""
+    from ne_dreamer_jax.envs.config import DmcConfig
+    from ne_dreamer_jax.runs import checkpoint, control_suite, evaluation
+
+    with refusing(run_directory.RefusedError, FileNotFoundError, checkpoint.DamagedError, ValueError):
+        loaded = evaluation.load(logdir, prefer=options["prefer"])
+        env = loaded.config.env
+        if not isinstance(env, DmcConfig):
+            raise ValueError(f"--backend dm_control: expected a run of a dmc task, got one of {env.task}")
+        content = evaluation.evaluate(logdir, None, echo=say, **options)
+    theirs = {}
+    for name, key in evaluation.keys(options["seed"]).items():
+        with refusing(RuntimeError):
+            played = control_suite.evaluate(
+                env, loaded.agent, loaded.state.params, key, options["episodes"], random=name == "random"
+            )
+        theirs[name] = evaluation.summary(played)
+        say(evaluation.line(name, played, " in dm_control"))
+    run_directory.write_evaluation(run_directory.RunDirectory(logdir), content | {"dm_control": theirs})
 
 
 _NO_OPENGL = ("", "disable", "disabled", "off", "0", "false", "no")
@@ -133,6 +108,3 @@ def allow_opengl() -> None:
         raise ValueError(f"MUJOCO_GL: no way to draw is called {given!r}. {settings.did_you_mean(given, _OPENGL)}")
     if given.lower() in _NO_OPENGL:
         os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
-
-
-EVALUATION = 0x65_76_61_6C  # sets these episodes apart from those of a run with the same seed

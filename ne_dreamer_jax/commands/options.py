@@ -88,8 +88,3 @@ def find_devices() -> None:
         asked = os.environ.get("JAX_PLATFORMS")
         hint = "" if asked is None else f" JAX_PLATFORMS is {asked!r}; 'cpu' is always there, or unset it."
         raise ValueError(f"JAX has nothing to compute with: {' '.join(str(error).split())}.{hint}") from error
-
-
-def quiet() -> None:
-    """Silences what the libraries log about themselves; call before JAX loads."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ne_dreamer_jax import envs, settings
-from ne_dreamer_jax.commands.options import Name, UserPath, find_devices, quiet, refusing, say
+from ne_dreamer_jax.commands.options import Name, UserPath, find_devices, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.quiet import quiet
 
 if TYPE_CHECKING:
     from ne_dreamer_jax.config import Config

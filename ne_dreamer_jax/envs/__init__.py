@@ -1,4 +1,4 @@
-"""Environments that run on the accelerator beside the learner.
+"""Environments: one door (`make`, `register`), one interface (`base`, `vector`), and a family a folder.
 
 ``names`` and the check of a mistyped name load neither JAX nor MuJoCo; ``make`` does.
 """
@@ -7,24 +7,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ne_dreamer_jax.envs.registry import check, names, split_dmc
+from ne_dreamer_jax.envs import registry
+from ne_dreamer_jax.envs.registry import check, names, register
 
 if TYPE_CHECKING:
     from ne_dreamer_jax.envs.base import Env
 
-__all__ = ["check", "make", "names"]
+__all__ = ["check", "make", "names", "register"]
 
 
 def make(name: str, **options: Any) -> Env:
-    """Makes the environment called ``name``, e.g. ``"dmc/walker_walk"``.
+    """Makes the environment called ``name``, e.g. ``"dmc/walker_walk"``, ``"mypackage.envs:make"``.
 
     Options of DMC tasks (see ``envs.dmc.make``): ``obs="pixels" | "vector" | "both"``, ``action_repeat=2``,
-    ``image_size=64``, ``fast=False``.
+    ``image_size=64``, ``fast=False``. Environments of people's own take none.
 
     Raises:
       ValueError: no environment has that name (the message names close matches), or an option has a bad value.
     """
-    domain, task = split_dmc(name)
-    from ne_dreamer_jax.envs import dmc
-
-    return dmc.make(domain, task, **options)
+    return registry.make(name, **options)

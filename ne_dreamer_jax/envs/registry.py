@@ -1,38 +1,98 @@
-"""The names of all environments, in plain Python: importing this loads neither JAX nor MuJoCo."""
+"""The one door to all environments: families by the prefix of their names, and people's own.
 
-import difflib
+In plain Python: importing this loads neither JAX nor MuJoCo. A family's module is loaded when an environment of it is
+made; its names stand in a module of their own that loads nothing.
+"""
 
-DMC: dict[str, tuple[str, ...]] = {
-    "acrobot": ("swingup",),
-    "ball_in_cup": ("catch",),
-    "cartpole": ("balance", "balance_sparse", "swingup", "swingup_sparse"),
-    "cheetah": ("run",),
-    "finger": ("spin", "turn_easy", "turn_hard"),
-    "hopper": ("hop", "stand"),
-    "pendulum": ("swingup",),
-    "quadruped": ("run", "walk"),
-    "reacher": ("easy", "hard"),
-    "walker": ("stand", "walk", "run"),
-}
-"""Domain (a module of ``envs/dmc/`` of that name) -> its tasks."""
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ne_dreamer_jax.envs.dmc.names import NAMES as DMC_NAMES
+from ne_dreamer_jax.settings.text import did_you_mean
+
+
+class Family(NamedTuple):
+    """Environments whose names begin alike."""
+
+    module: str
+    """Has ``make(name, **options) -> Env``."""
+    names: Callable[[], tuple[str, ...]]
+    """Those that can be made."""
+
+
+FAMILIES: dict[str, Family] = {"dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES)}
+"""Prefix -> family."""
+
+_registered: dict[str, Callable[[], Any]] = {}
+
+
+def register(name: str, make: Callable[[], Any]) -> None:
+    """Gives an environment of one's own a name, in this process: ``--task`` and ``envs.make`` take it from now on.
+
+    Args:
+      name: none that a family's prefix begins, and without a colon.
+      make: returns an ``envs.base.Env``; called when the environment is asked for.
+
+    Raises:
+      ValueError: the name is a family's, or taken.
+    """
+    if family_of(name) is not None or ":" in name or not name:
+        raise ValueError(
+            f"expected a name that begins with none of {', '.join(FAMILIES)} and has no colon, got {name!r}"
+        )
+    if name in _registered and _registered[name] is not make:
+        raise ValueError(f"expected a new name, got {name!r}, which another environment has already")
+    _registered[name] = make
 
 
 def names() -> tuple[str, ...]:
-    """All names that ``make`` takes, sorted."""
-    return tuple(sorted(f"dmc/{domain}_{task}" for domain, tasks in DMC.items() for task in tasks))
+    """All names that `make` takes, sorted."""
+    return tuple(sorted([*(name for family in FAMILIES.values() for name in family.names()), *_registered]))
 
 
-def split_dmc(name: str) -> tuple[str, str]:
-    """``"dmc/cartpole_swingup_sparse"`` -> ``("cartpole", "swingup_sparse")``."""
-    check(name)
-    return next((domain, task) for domain, tasks in DMC.items() for task in tasks if name == f"dmc/{domain}_{task}")
+def family_of(name: str) -> str | None:
+    """The prefix of a name's family; None for environments of people's own."""
+    return next((prefix for prefix in FAMILIES if name.startswith(prefix)), None)
 
 
 def check(name: str) -> None:
-    """Raises ValueError, naming the closest matches, unless ``name`` is registered."""
-    known = names()
-    if name in known:
+    """Raises ValueError, naming the closest matches, unless ``name`` is registered or a ``module:function``."""
+    if name in names():
         return
-    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    hint = f"did you mean {', '.join(close)}?" if close else f"registered are: {', '.join(known)}"
-    raise ValueError(f"no environment is called {name!r}; {hint}")
+    if ":" in name and family_of(name) is None:
+        module, _, function = name.partition(":")
+        if all(part.isidentifier() for part in [*module.split("."), function]):
+            return
+        raise ValueError(f"expected module:function, such as mypackage.envs:make, got {name!r}")
+    raise ValueError(
+        f"no environment is called {name!r}. {did_you_mean(name, names())} One of your own is named as "
+        "module:function, or by envs.register(name, make)"
+    )
+
+
+def make(name: str, **options: Any) -> Any:
+    """Makes an environment; errors as of `envs.make`."""
+    check(name)
+    prefix = family_of(name)
+    if prefix is not None:
+        return importlib.import_module(FAMILIES[prefix].module).make(name, **options)
+    if options:
+        raise ValueError(f"{name}: expected no options for an environment of one's own, got {', '.join(options)}")
+    return (_registered.get(name) or _imported(name))()
+
+
+def _imported(name: str) -> Callable[[], Any]:
+    """What a ``module:function`` names."""
+    module_name, _, function = name.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ValueError(f"--task {name}: {error}; run the command where Python finds {module_name}") from error
+    found = getattr(module, function, None)
+    if not callable(found):
+        near = did_you_mean(function, [key for key in vars(module) if not key.startswith("_")])
+        raise ValueError(f"--task {name}: expected a function {function} in {module_name}. {near}")
+    return found

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.agents.base import Agent
-from ne_dreamer_jax.config import EnvConfig
+from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.envs import dmc, registry
 from ne_dreamer_jax.loop import Evaluation, random_action
 from ne_dreamer_jax.types import Array, Params, TimeStep
@@ -24,12 +25,12 @@ from ne_dreamer_jax.types import Array, Params, TimeStep
 class Player:
     """One environment of dm_control, stepped and observed as ours are."""
 
-    def __init__(self, config: EnvConfig, seed: int) -> None:
+    def __init__(self, config: DmcConfig, seed: int) -> None:
         from absl import logging
         from dm_control import suite
 
         logging.set_verbosity(logging.ERROR)  # cheetah's file is in an older style, and MuJoCo says so each time
-        domain, task = registry.split_dmc(config.task)
+        domain, task = dmc_names.split(config.task)
         self._env = suite.load(domain, task, task_kwargs={"random": seed})
         self._config = config
         self._camera = dmc.load(domain, task).camera
@@ -79,7 +80,7 @@ class Player:
 
 
 def evaluate(
-    config: EnvConfig, agent: Agent, params: Params, key: Array, episodes: int, random: bool = False
+    config: DmcConfig, agent: Agent, params: Params, key: Array, episodes: int, random: bool = False
 ) -> Evaluation:
     """As ``Loop.evaluate``, in ``episodes`` environments of dm_control: the policy's mode, or random actions.
 

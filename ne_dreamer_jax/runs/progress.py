@@ -30,7 +30,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
     agent_steps = schedule.total * schedule.num_envs
     lines = [
-        f"{config.env.task} from {config.env.obs}, {config.method}, seed {config.seed}, on {_devices(shapes)}",
+        f"{config.env.task} from {_seen(config)}, {config.method}, seed {config.seed}, on {_devices(shapes)}",
         f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
         f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
         f"  learning  {loop.budget.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
@@ -39,6 +39,10 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]
     return lines if loop.budget.updates or options.replay_ratio == 0 else [*lines, f"  WARNING   {NOTHING_LEARNED}"]
+
+
+def _seen(config: Config) -> str:
+    return getattr(config.env, "obs", "what it observes")
 
 
 def _devices(shapes: LoopState) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax.runs import pictures
 from ne_dreamer_jax.runs import plots
 from ne_dreamer_jax.runs import progress
@@ -32,16 +32,19 @@ from ne_dreamer_jax.system import compile_cache
 from ne_dreamer_jax.runs import metrics
 from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.agents import make_agent
 from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.types import images_of
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
+from ne_dreamer_jax.envs.config import OwnConfig
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 
 Echo = Callable[[str], None]
-FRAMES_PER_SECOND = 30.0  # of videos; environments differ in how much time a step stands for
 
 
 class Run(NamedTuple):
@@ -51,6 +54,12 @@ class Run(NamedTuple):
     agent: Agent
     loop: Loop
     shapes: LoopState  # shapes and dtypes of the whole state
+    step_seconds: float | None = None  # simulated time of an agent step
+
+    @property
+    def schedule(self) -> Schedule:
+        """When chunks end and evaluations are due."""
+        return Schedule.of(self.config, self.loop)
 
 
 def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> Run:
@@ -63,17 +72,13 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
     Raises:
       ValueError: what does not fit together, or not into memory.
     """
-    options = config.env
-    env = env or nedreamer.envs.make(
-        options.task,
-        obs=options.obs,
-        action_repeat=options.action_repeat,
-        image_size=options.image_size,
-        fast=options.fast,
-    )
-    agent = nedreamer.make_agent(config.agent, env.spec)
-    loop = loops.make(config.loop, env, agent, options.action_repeat, mesh)
-    return Run(config, agent, loop, loop.state_shapes())
+    if env is None:
+        env = env_configs.make(config.env)
+    elif not isinstance(config.env, OwnConfig):
+        config = replace(config, env=OwnConfig(action_repeat=config.env.action_repeat))
+    agent = make_agent(config.agent, env.spec)
+    loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
+    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds)
 
 
 def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
@@ -93,7 +98,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     Raises:
       ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
     """
-    schedule = Schedule.of(run.config, run.loop)
+    schedule = run.schedule
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
     state, lines = _start(run, files, start_key, echo)
     counters = schedule.counters(state)
@@ -140,10 +145,10 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     if not first:
         return 0
     checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
-    if "image" in run.agent.spec.observation and not files.video.exists():
+    if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
-        pictures.attempt(lambda: video.write(frames, files.video, fps=FRAMES_PER_SECOND), files.video, echo)
+        pictures.attempt(lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo)
     draw(run, files, record, echo)
     for line in _conclusion(run, files, record):
         echo(line)
@@ -231,7 +236,7 @@ def _same_for_all(files: RunDirectory, env_step: int) -> None:
 
 
 def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
-    draws = "and draw " if "image" in run.agent.spec.observation else ""
+    draws = "and draw " if images_of(run.agent.spec) else ""
     echo(f"Compiling the training chunk: act, step {draws}the environments, store, sample, update.")
     jitted: Any = run.loop.chunk
     began = time.perf_counter()

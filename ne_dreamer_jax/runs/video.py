@@ -12,6 +12,11 @@ WIDTH = 384  # pixels that a video has at least, in whole multiples of the frame
 PATIENCE = 600.0  # seconds that ffmpeg may take
 
 
+def frame_rate(step_seconds: float | None) -> float:
+    """Frames a second at which an environment is seen as fast as it is; 30 for one without a clock of its own."""
+    return 30.0 if step_seconds is None else min(max(1.0 / step_seconds, 1.0), 60.0)
+
+
 def write(frames: np.ndarray | None, path: Path, *, fps: float) -> None:
     """Writes an episode as H.264, which browsers play, each pixel drawn as a square so that the agent's view is seen.
 

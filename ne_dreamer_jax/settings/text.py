@@ -232,9 +232,10 @@ def _encode(annotation: Any, value: Any) -> Any:
 
 
 def _decode(annotation: Any, data: Any, path: str) -> Any:
+    tagged = len(_dataclasses(annotation)) > 1
     for choice in _choices(annotation):
         try:
-            value = _decode_one(choice, data, path, tagged=len(_dataclasses(annotation)) > 1)
+            value = _decode_one(choice, data, path, default=next(iter(_dataclasses(annotation)), None), tagged=tagged)
         except _Unfit:
             continue
         ranges.check_value(annotation, value, path)
@@ -242,10 +243,11 @@ def _decode(annotation: Any, data: Any, path: str) -> Any:
     raise ValueError(f"{path}: expected {ranges.describe(annotation)}, got {data!r}")
 
 
-def _decode_one(annotation: Any, data: Any, path: str, *, tagged: bool) -> Any:
+def _decode_one(annotation: Any, data: Any, path: str, *, default: str | None, tagged: bool) -> Any:
+    """``default`` is the class of data without a tag, from before there was more than one to choose from."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if _is_dataclass(annotation) and isinstance(data, Mapping):
-        if tagged and data.get(TAG) != annotation.__name__:
+        if tagged and data.get(TAG, default) != annotation.__name__:
             raise _Unfit
         given = {name: value for name, value in data.items() if not (tagged and name == TAG)}
         hints = _fields(annotation)

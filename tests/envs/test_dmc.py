@@ -13,8 +13,9 @@ import pytest
 
 from benchmarks import dmc_equality as equality
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.envs import conformance, registry
+from ne_dreamer_jax.envs import conformance
 from ne_dreamer_jax.envs.dmc import Task, environment
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.envs.dmc import simulation as stepping
 from ne_dreamer_jax.envs.dmc.simulation import mjx
 
@@ -83,7 +84,7 @@ def test_the_model_its_timing_and_its_names_are_dm_controls(name):
         "finger": ["geom_contype", "geom_conaffinity", "body_contype", "body_conaffinity"],
         "quadruped": ["exclude_signature"],
     }
-    domain, _ = registry.split_dmc(name)
+    domain, _ = dmc_names.split(name)
     exempt = {"paths", *per_episode.get(domain, []), *dropped_contacts.get(domain, [])}
     compared = 0
     for field in dir(model):

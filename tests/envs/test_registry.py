@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.envs import registry
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 
 TWENTY_TASKS = {
     "dmc/acrobot_swingup",
@@ -37,8 +37,8 @@ def test_the_papers_twenty_control_suite_tasks_are_registered():
 
 
 def test_a_dmc_name_splits_into_domain_and_task():
-    assert registry.split_dmc("dmc/ball_in_cup_catch") == ("ball_in_cup", "catch")
-    assert registry.split_dmc("dmc/cartpole_swingup_sparse") == ("cartpole", "swingup_sparse")
+    assert dmc_names.split("dmc/ball_in_cup_catch") == ("ball_in_cup", "catch")
+    assert dmc_names.split("dmc/cartpole_swingup_sparse") == ("cartpole", "swingup_sparse")
 
 
 def test_a_mistyped_name_is_refused_with_close_matches():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax.envs import dmc
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.envs.dmc import support
 from ne_dreamer_jax.envs.dmc.simulation import integrated
 
@@ -389,7 +390,7 @@ def test_what_is_switched_off_is_not_warned_of(off):
 def test_no_domain_has_anything_that_is_simulated_otherwise():
     from ne_dreamer_jax.envs import registry
 
-    tasks = [registry.split_dmc(name) for name in registry.names() if name.startswith("dmc/")]
+    tasks = [dmc_names.split(name) for name in registry.names() if name.startswith("dmc/")]
     assert len(tasks) == 20
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -9,8 +9,9 @@ import pytest
 from dm_control import suite
 
 import ne_dreamer_jax as nedreamer
+from ne_dreamer_jax.commands import evaluate
 from ne_dreamer_jax.config import EnvConfig
-from ne_dreamer_jax.runs import control_suite, evaluate
+from ne_dreamer_jax.runs import control_suite
 from ne_dreamer_jax.types import PolicyState
 
 EPISODES = 2

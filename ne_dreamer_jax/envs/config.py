@@ -1,0 +1,85 @@
+"""Settings of environments: a frozen dataclass for each family, in plain Python."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal
+
+from ne_dreamer_jax.envs import registry
+from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings.ranges import Range
+
+Repeat = Annotated[int, Range(1, 1_000_000)]
+ImageSize = Annotated[int, Range(1, 4_096)]
+
+GIVEN = "given in code"
+"""The task of an environment that was passed as an object, and has no name."""
+
+
+@dataclass(frozen=True)
+class DmcConfig:
+    """A task of the Control Suite, and how it is observed."""
+
+    task: str = "dmc/walker_walk"
+    obs: Literal["pixels", "vector", "both"] = "pixels"
+    """pixels, vector or both."""
+    action_repeat: Repeat = 2
+    """Environment steps for which each action is held; rewards are summed."""
+    image_size: ImageSize = 64
+    """Height and width of the frames."""
+    fast: bool = False
+    """Whether contacts are solved with a shorter line search than MuJoCo's; benchmarks/DMC.md measures the error."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+@dataclass(frozen=True)
+class OwnConfig:
+    """An environment of one's own, which says itself how it is observed."""
+
+    task: str = GIVEN
+    """A name given to ``envs.register``, a ``module:function``, or that it is passed as an object."""
+    action_repeat: Repeat = 1
+    """Environment steps that one of its steps counts for."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+EnvConfig = DmcConfig | OwnConfig
+"""The settings that a configuration may choose from: which, the task's name decides."""
+
+_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, None: OwnConfig}
+
+
+def for_task(task: str, like: Any) -> Any:
+    """The settings of a task: ``like``, where they are of its family, else its family's with the fields they share.
+
+    Raises:
+      ValueError: no environment is called that, with close matches.
+    """
+    registry.check(task)
+    kind = _OF_FAMILY[registry.family_of(task)]
+    known = {field.name for field in fields(kind)} - {"task", "action_repeat"}
+    if isinstance(like, kind):
+        known.add("action_repeat")
+    shared = {field.name: getattr(like, field.name) for field in fields(like) if field.name in known}
+    return kind(**{**shared, "task": task})
+
+
+def make(config: Any) -> Any:
+    """The environment of these settings.
+
+    Raises:
+      ValueError: as ``envs.make``; or for an environment that was given as an object, and has to be given again.
+    """
+    if isinstance(config, OwnConfig):
+        if config.task == GIVEN:
+            raise ValueError(
+                "this run was made with an environment given in code: give it again (env=...), or train with "
+                "--task module:function or a name given to envs.register, which the run then remembers"
+            )
+        return registry.make(config.task)
+    options = {field.name: getattr(config, field.name) for field in fields(config) if field.name != "task"}
+    return registry.make(config.task, **options)
