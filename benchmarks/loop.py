@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, refusing
+from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
@@ -18,9 +17,7 @@ PARTS = ("environment", "rendering", "acting", "replay", "learning")
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.option(
-    "--task", "tasks", type=Name("task", envs.names()), multiple=True, default=("dmc/walker_walk",), show_default=True
-)
+@click.option("--task", "tasks", type=Task(), multiple=True, default=("dmc/walker_walk",), show_default=True)
 @click.option("--size", "sizes", type=Name("size", names.SIZES), multiple=True, default=("12m",), show_default=True)
 @click.option("--capacity", type=click.IntRange(2), default=20_000, show_default=True, help="Transitions in replay.")
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)

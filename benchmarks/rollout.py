@@ -8,15 +8,12 @@ from typing import Any
 import click
 
 from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name
 from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.option(
-    "--task", "tasks", type=Name("task", envs.names()), multiple=True, default=("dmc/walker_walk",), show_default=True
-)
+@click.option("--task", "tasks", type=Task(), multiple=True, default=("dmc/walker_walk",), show_default=True)
 @click.option(
     "--envs",
     "counts",

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, UserPath, refusing, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
@@ -46,7 +45,7 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
 
     @click.command(context_settings={"max_content_width": 110}, help=help_text)
     @click.argument("directory", type=UserPath(file_okay=False))
-    @click.option("--task", type=Name("task", envs.names()), help="What to learn; default: the preset's.")
+    @click.option("--task", type=Task(), help="What to learn; default: the preset's.")
     @click.option(
         "--method",
         "chosen",

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from ne_dreamer_jax import envs
-from ne_dreamer_jax.commands.options import Name, UserPath, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, say
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
 
@@ -59,7 +58,7 @@ class Job:
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.option("--task", "tasks", type=Name("task", envs.names()), multiple=True, required=True, help="May be repeated.")
+@click.option("--task", "tasks", type=Task(), multiple=True, required=True, help="May be repeated.")
 @click.option(
     "--method",
     "methods",

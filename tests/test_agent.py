@@ -239,7 +239,7 @@ def test_acting_refuses_an_unknown_mode_and_other_observations():
         ({"loss_scales": {"reward": 1.0}}, r"missing \['actor', 'continue'"),
         (
             {"compute_dtype": "float16"},
-            r"agent.compute_dtype: expected one of \['float32', 'bfloat16'\], got 'float16'",
+            r"compute_dtype: expected float32 or bfloat16, got 'float16'",
         ),
         ({"batch_length": 9}, "Sequences of 9 steps, but the predictor has positions for 8"),
         (

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import pytest
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax import envs, make_agent, objectives, settings
 from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax import make_agent, objectives, settings
 from ne_dreamer_jax.agents import drqv2, optim
 from ne_dreamer_jax.agents.dreamer import world_model
 from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
 from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
@@ -295,6 +296,7 @@ CHANGES = {
         "chunk_steps": "5",
         "eval_every": "300",
         "eval_episodes": "3",
+        "eval_max_steps": "5",
         "write_latents": "false",
         "time_limits": "unmarked",
         "latent_dtype": "bfloat16",
@@ -385,7 +387,7 @@ def loop(config):
     """Sizes, the schedule and the compiled program."""
     env = counting.env()
     made = loops.make(config.loop, env, counting.stub(env.spec), 2)
-    yield str((made.vector_steps, made.updates, made.capacity, made.replay_bytes, config.loop.eval_episodes))
+    yield str((made.budget, made.replay_bytes, config.loop.eval_episodes, config.loop.eval_max_steps))
     yield str(Schedule.of(config, made))
     state = jax.eval_shape(made.init, KEY)
     yield program(made.chunk, state, jnp.zeros((), jnp.int32))
@@ -513,7 +515,7 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
         asked.append((task, options))
         return counting.env(image=False)
 
-    monkeypatch.setattr(envs, "make", make)
+    monkeypatch.setattr(registry, "make", make)
     changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48", "fast": "true"}
     assert set(changes) == {field.name for field in fields(DmcConfig)}
     base = training.build(BASE).loop

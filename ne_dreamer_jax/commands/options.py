@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from ne_dreamer_jax import settings
+from ne_dreamer_jax import envs, settings
 
 
 class Name(click.ParamType):
@@ -30,6 +30,24 @@ class Name(click.ParamType):
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
         """What stands for the value in the help."""
         return self.name.upper()
+
+
+class Task(click.ParamType):
+    """The name of an environment, or a ``module:function`` that makes one."""
+
+    name = "task"
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The value, if there is such an environment; modules are not imported for that."""
+        try:
+            envs.check(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+        return value
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """What stands for the value in the help."""
+        return "TASK"
 
 
 class UserPath(click.Path):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ne_dreamer_jax import envs, settings
-from ne_dreamer_jax.commands.options import Name, UserPath, find_devices, refusing, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.quiet import quiet
@@ -42,7 +42,7 @@ FLAGS = {  # option -> the setting that it changes
     show_default=True,
     help=f"The setting to start from: {', '.join(names.PRESETS)}. The options below change it.",
 )
-@click.option("--task", type=Name("task", envs.names()), help="What to learn, such as dmc/walker_walk.")
+@click.option("--task", type=Task(), help="What to learn, such as dmc/walker_walk.")
 @click.option("--method", type=Name("method", names.METHODS), help=f"One of {', '.join(names.METHODS)}.")
 @click.option("--size", type=Name("size", names.SIZES), help=f"Parameters, roughly: {', '.join(names.SIZES)}.")
 @click.option("--obs", type=Name("observation", names.OBSERVATIONS), metavar="KIND", help="pixels, vector or both.")

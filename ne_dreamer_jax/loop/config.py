@@ -13,7 +13,7 @@ from ne_dreamer_jax.settings.ranges import Count, CountOrNone, Range
 class LoopConfig:
     """Settings of the training loop. One agent step is ``env.action_repeat`` environment steps of one environment."""
 
-    env_steps: Annotated[int, Range(0, 10**15)] = 1_000_000
+    env_steps: Annotated[int, Range(1, 10**15)] = 1_000_000
     """Environment steps in all, over all environments."""
     num_envs: Annotated[int, Range(1, 10_000_000)] = 16
     """N, environments stepped together."""

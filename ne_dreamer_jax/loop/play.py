@@ -24,7 +24,7 @@ class Evaluation(NamedTuple):
 
     returns: Array  # float32 [M]
     lengths: Array  # int32 [M], agent steps
-    complete: Array  # bool [M], ended by itself: neither cut by the environment nor left at the bound
+    complete: Array  # bool [M], False where the environment cut it: broken physics, or an action that was not finite
     frames: Any = None  # uint8 numpy [steps, H, W, C] of the first episode's first image, or None
     unfinished: int = 0  # episodes that had not ended at the bound
     steps: Any = None  # numpy: `Steps` of all episodes, where they were asked for
@@ -85,7 +85,7 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
         return Evaluation(
             returns=carry.returns,
             lengths=carry.lengths,
-            complete=carry.complete & carry.done,
+            complete=carry.complete,
             frames=np.concatenate(clips) if clips else None,
             unfinished=int((~np.asarray(carry.done)).sum()),
             steps=jax.tree.map(lambda *parts: np.concatenate(parts), *seen) if seen else None,

@@ -98,6 +98,12 @@ def add(replay: Replay, transition: Transition) -> Replay:
     return replace(replay, data=data, position=(replay.position + 1) % rows, size=jnp.minimum(replay.size + 1, rows))
 
 
+def filled(replay: Replay, data: Transition) -> Replay:
+    """The ring full of ``data``, ``[C, N, ...]`` in its own shapes and dtypes, oldest row first."""
+    shapes.check(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), replay.data), data, "the replay")
+    return replace(replay, data=data, size=jnp.asarray(data.reward.shape[0], jnp.int32))
+
+
 def next_row(replay: Replay) -> Array:
     """The row that `add` will write to, int32 []."""
     return replay.position

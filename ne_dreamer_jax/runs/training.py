@@ -177,6 +177,11 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
         f"Evaluation: return {values['eval/return']:.1f} ± {values['eval/return_std']:.1f} over "
         f"{len(evaluation.returns)} episodes, in {progress.duration(seconds)}."
     )
+    if evaluation.unfinished:
+        echo(
+            f"{evaluation.unfinished} of {len(evaluation.returns)} episodes had not ended after "
+            f"{run.config.loop.eval_max_steps:,} steps (loop.eval_max_steps)."
+        )
     if not finite:
         echo("The agent has diverged: some of its parameters are not finite. It is not kept as the best.")
     elif cut:

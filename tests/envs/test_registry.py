@@ -42,12 +42,12 @@ def test_a_dmc_name_splits_into_domain_and_task():
 
 
 def test_a_mistyped_name_is_refused_with_close_matches():
-    with pytest.raises(ValueError, match=r"'dmc/waker_walk'.*did you mean.*dmc/walker_walk"):
+    with pytest.raises(ValueError, match=r"'dmc/waker_walk'.*Did you mean.*dmc/walker_walk"):
         envs.make("dmc/waker_walk")
 
 
 def test_a_name_like_no_other_is_refused_with_the_list():
-    with pytest.raises(ValueError, match=r"registered are.*dmc/cartpole_balance"):
+    with pytest.raises(ValueError, match=r"Known: .*dmc/cartpole_balance"):
         envs.make("zzz")
 
 

@@ -61,7 +61,9 @@ def build(config, *, image: bool = True) -> training.Run:
         updates = state.train.update - updates
         none = jnp.zeros((), jnp.int32)
         finished = Finished(episodes, kernel * episodes, EPISODE * episodes)
-        return state, Report(updates, {"loss/total": jnp.square(kernel) * updates}, finished, none, none)
+        return state, Report(
+            updates, {"loss/total": jnp.square(kernel) * updates.astype(jnp.float32)}, finished, none, none
+        )
 
     def evaluate(params, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False):
         count = episodes or config.loop.eval_episodes

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from experiments import evaluate, train
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import envs, settings
+from ne_dreamer_jax.commands.train import FLAGS
 from ne_dreamer_jax.runs import run_directory, training
 from ne_dreamer_jax.settings import names
 from tests.experiments import stub
@@ -129,9 +130,9 @@ def test_drqv2_is_set_up_for_the_task():
 
 
 def test_every_option_names_a_setting():
-    flags = {option.name for option in train.main.params} & set(train.FLAGS)
-    assert flags == set(train.FLAGS)
-    assert set(train.FLAGS.values()) <= set(settings.paths(configs.preset("dmc")))
+    flags = {option.name for option in train.main.params} & set(FLAGS)
+    assert flags == set(FLAGS)
+    assert set(FLAGS.values()) <= set(settings.paths(configs.preset("dmc")))
 
 
 def test_help_names_every_preset_method_size_and_task():

@@ -10,7 +10,7 @@ from dm_control import suite
 
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax.commands import evaluate
-from ne_dreamer_jax.config import EnvConfig
+from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.runs import control_suite
 from ne_dreamer_jax.types import PolicyState
 
@@ -37,7 +37,7 @@ def play(config, random=False):
 
 
 def test_returns_are_dm_controls_own():
-    config = EnvConfig("dmc/pendulum_swingup", obs="vector")
+    config = DmcConfig("dmc/pendulum_swingup", obs="vector")
     env, found, seen = play(config)
     assert found.lengths.tolist() == [500, 500]
     assert len(seen) == 500  # none is asked after the last
@@ -60,7 +60,7 @@ def test_returns_are_dm_controls_own():
 
 
 def test_a_random_policy_does_not_repeat_itself():
-    _, found, _ = play(EnvConfig("dmc/cartpole_swingup", obs="vector"), random=True)
+    _, found, _ = play(DmcConfig("dmc/cartpole_swingup", obs="vector"), random=True)
     assert found.returns[0] != found.returns[1]
     assert (found.returns > 0).all()
 
@@ -84,4 +84,4 @@ def test_without_opengl_the_message_says_what_to_install(monkeypatch):
 
     monkeypatch.setattr(control_suite.Player, "draw", refuse)
     with pytest.raises(RuntimeError, match="Install OSMesa"):
-        play(EnvConfig("dmc/pendulum_swingup", image_size=32))
+        play(DmcConfig("dmc/pendulum_swingup", image_size=32))

@@ -79,7 +79,7 @@ def test_a_command_runs_once(tmp_path, loses_its_environment):
     module = tmp_path / "command.py"
     module.write_text(
         "import os, sys\n"
-        "from experiments import pages\n"
+        "from ne_dreamer_jax.system import pages\n"
         f"if {loses_its_environment}:\n"
         f"    sys.executable = {str(tmp_path / 'wrapper')!r}\n"
         "pages.use_large_pages('command')\n"

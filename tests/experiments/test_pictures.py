@@ -117,7 +117,7 @@ def test_a_picture_that_can_not_be_written_leaves_nothing(tmp_path):
 def test_curves_are_drawn_whatever_matplotlib_is_told(tmp_path, rc):
     (tmp_path / "matplotlibrc").write_text(rc)
     code = (
-        "import sys, pathlib; from experiments import plots\n"
+        "import sys, pathlib; from ne_dreamer_jax.runs import plots\n"
         "plots.learning_curve([], pathlib.Path('curve.png'), title='demo', env_steps=9)\n"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )

@@ -32,7 +32,7 @@ def test_every_run_has_its_command_and_its_directory(tmp_path):
     assert len(commands) == 6
     got = set()
     for command in commands:
-        assert command[:3] == [sys.executable, "-m", "experiments.train"]
+        assert command[:4] == [sys.executable, "-m", "ne_dreamer_jax", "train"]
         options = train.main.make_context("train", command[3:]).params
         assert (options["size"], options["preset"], options["method"]) == ("1m", "dmc", "ne_dreamer/no_shift")
         assert options["assignments"] == ("loop.num_envs=4", "agent.batch_size=8")

@@ -1,0 +1,61 @@
+"""Learning from what replay holds, without an environment."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.loop.learn import draw_batch, learn_what_is_due
+from ne_dreamer_jax.replay import ring, storage
+from ne_dreamer_jax.system.numerics import in_32_bits
+from ne_dreamer_jax.types import Array, Metrics
+
+
+def train_offline(
+    agent: Agent, state: Any, replay: ring.Replay, key: Array, updates: int, write_latents: bool = True
+) -> tuple[Any, ring.Replay, Metrics]:
+    """So many updates on batches out of replay, as one compiled program.
+
+    Args:
+      agent: of ``make_agent``.
+      state: its train state; donated, as is ``replay``.
+      replay: such as ``replay.from_episodes`` gives.
+      key: consumed, for the batches.
+      updates: how many, at least one.
+      write_latents: whether posterior latents are written back into replay.
+
+    Returns:
+      The new train state, replay, and the metrics' means over the updates, float32 [].
+
+    Raises:
+      ValueError: replay holds too few steps for a sequence, or no update is asked for.
+    """
+    length = agent.config.batch_length
+    if updates < 1:
+        raise ValueError(f"updates: expected at least 1, got {updates}")
+    if not bool(ring.can_sample(replay, length)):
+        raise ValueError(
+            f"replay: expected more than agent.batch_length {length} steps, got {int(replay.size)}; take shorter "
+            "sequences or more data"
+        )
+    return _train(agent, write_latents, state, replay, key, jnp.asarray(updates, jnp.int32))
+
+
+def _train(
+    agent: Agent, write_latents: bool, state: Any, replay: ring.Replay, key: Array, updates: Array
+) -> tuple[Any, ring.Replay, Metrics]:
+    kept = storage.pixels()
+
+    def run(state: Any, replay: ring.Replay, key: Array, updates: Array) -> tuple[Any, ring.Replay, Metrics]:
+        batch = jax.eval_shape(partial(draw_batch, agent, kept), replay, key)
+        shapes = jax.eval_shape(agent.train_step, state, batch)[2]
+        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        state, replay, sums = learn_what_is_due(agent, kept, write_latents, updates, state, replay, key, sums)
+        count = jnp.maximum(updates, 1).astype(jnp.float32)
+        return state, replay, {name: value / count for name, value in sums.items()}
+
+    return jax.jit(in_32_bits(run), donate_argnums=(0, 1))(state, replay, key, updates)

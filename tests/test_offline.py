@@ -1,0 +1,100 @@
+"""Episodes of other people's in replay, and learning from them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ne_dreamer_jax import loop, make_agent, replay
+from ne_dreamer_jax.replay import Episode, ring
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+SPEC = tiny.BOTH
+SIZES = tiny.CONFIG.latent_sizes
+
+
+def episode(length=6, terminal=False, seed=0, **changes):
+    rng = np.random.default_rng(seed)
+    obs = {
+        "image": rng.integers(0, 255, (length + 1, 8, 8, 3), np.uint8),
+        "vector": rng.normal(size=(length + 1, 3)),  # float64, as data sets have it
+    }
+    made = Episode(obs, rng.uniform(-1, 1, (length, 2)), rng.normal(size=length), terminal)
+    return made._replace(**changes)
+
+
+def test_steps_are_held_in_the_time_convention():
+    episodes = [episode(4, True, 0), episode(5, False, 1)]
+    data = replay.from_episodes(iter(episodes), SPEC, SIZES).data
+    begin = 0
+    for made in episodes:
+        length = len(made.reward)
+        rows = slice(begin, begin + length + 1)
+        np.testing.assert_array_equal(data.obs["image"][rows, 0], made.obs["image"])
+        np.testing.assert_allclose(data.obs["vector"][rows, 0], made.obs["vector"], rtol=1e-6)
+        np.testing.assert_allclose(data.action[rows, 0][:-1], made.action, rtol=1e-6)
+        np.testing.assert_allclose(data.reward[rows, 0], [0, *made.reward], rtol=1e-6)  # on arrival
+        np.testing.assert_array_equal(data.is_first[rows, 0], np.arange(length + 1) == 0)
+        np.testing.assert_array_equal(data.is_last[rows, 0], np.arange(length + 1) == length)
+        assert bool(data.is_terminal[begin + length, 0]) == made.is_terminal
+        begin += length + 1
+    assert begin == data.reward.shape[0]
+
+
+def test_every_sequence_of_the_data_is_sampled_and_none_that_wraps_around():
+    held = replay.from_episodes([episode(6, seed=s) for s in range(3)], SPEC, SIZES)
+    batch = jax.jit(replay.sample, static_argnums=(2, 3))(held, jax.random.key(0), 500, 5)
+    first = np.asarray(batch.index[:, 0])
+    assert set(first) == set(range(1, 21 - 5 + 1))
+    np.testing.assert_array_equal(np.diff(batch.index, axis=1), 1)
+
+
+def test_an_agent_learns_from_episodes_without_an_environment():
+    agent = make_agent(tiny.CONFIG, SPEC)
+    held = replay.from_episodes([episode(9, seed=s) for s in range(3)], SPEC, SIZES)
+    state = agent.init(jax.random.key(0))
+    before = jax.tree.map(np.asarray, state.params)
+    state, held, metrics = loop.train_offline(agent, state, held, jax.random.key(1), updates=3)
+    assert int(state.update) == 3
+    assert all(np.isfinite(value) for value in metrics.values())
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), before, jax.tree.map(np.asarray, state.params))
+    assert all(jax.tree.leaves(changed["actor"]))
+    assert np.any(held.data.latent.deter), "latents are written back"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reward": np.zeros(5)}, r"episode 1, action: expected float32\[5, 2\], got float64\[6, 2\]"),
+        ({"reward": np.zeros((6, 1))}, r"episode 1, reward: expected float32\['L'\], got float64\[6, 1\]"),
+        ({"action": np.zeros((7, 2))}, r"episode 1, action: expected float32\[6, 2\], got float64\[7, 2\]"),
+        ({"action": np.full((6, 2), 3.0)}, r"episode 1, action: expected values from -1 to 1, got 3.0 to 3.0"),
+        ({"obs": {"vector": np.zeros((7, 3))}}, r"expected observations named \['image', 'vector'\], got \['vector'\]"),
+        (
+            {"obs": {"image": np.zeros((7, 8, 8, 3)), "vector": np.zeros((7, 3))}},
+            r"obs\['image'\]: expected uint8\[7, 8, 8, 3\], got float64\[7, 8, 8, 3\]",
+        ),
+        (
+            {"obs": {"image": np.zeros((6, 8, 8, 3), np.uint8), "vector": np.zeros((7, 3))}},
+            r"obs\['image'\]: expected uint8\[7, 8, 8, 3\], got uint8\[6, 8, 8, 3\]",
+        ),
+        ({"reward": np.full(6, np.nan)}, r"episode 1, reward: expected finite numbers, got nan"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_place(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replay.from_episodes([episode(), episode(**changes)], SPEC, SIZES)
+
+
+def test_too_little_data_is_refused():
+    with pytest.raises(ValueError, match="at least one episode, got none"):
+        replay.from_episodes([], SPEC, SIZES)
+    agent = make_agent(tiny.CONFIG, SPEC)
+    held = replay.from_episodes([episode(3)], SPEC, SIZES)
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
+    with pytest.raises(ValueError, match=r"expected more than agent.batch_length 5 steps, got 4"):
+        loop.train_offline(agent, shapes, held, jax.random.key(0), 1)
+    assert int(ring.next_row(held)) == 0
+    assert held.data.reward.dtype == jnp.float32
