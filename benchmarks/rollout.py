@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from ne_dreamer_jax import envs
+from ne_dreamer_jax.commands.options import Task
 from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.system.quiet import quiet
 

@@ -7,7 +7,7 @@ import pytest
 
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
-from ne_dreamer_jax.types import ContinuousAction, EnvSpec, Latent
+from ne_dreamer_jax.types import ContinuousAction, EnvSpec, Latent, TimeStep
 from tests import tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -49,17 +49,8 @@ def test_imagination_starts_where_it_is_told_and_its_heads_judge_its_features(ma
 
 def test_the_mode_of_the_heads_is_the_action_of_acting(made):
     agent, state = made
-    timestep = tiny.timestep(agent.spec) if hasattr(tiny, "timestep") else None
-    if timestep is None:
-        batch = tiny.batch(agent.spec)
-        from ne_dreamer_jax.types import TimeStep
-
-        take = lambda x: x[:, 0]
-        timestep = TimeStep(
-            jax.tree.map(take, dict(batch.obs)),
-            *map(take, (batch.reward, batch.is_first, batch.is_last)),
-            batch.is_terminal[:, 0],
-        )
+    batch = jax.tree.map(lambda x: x[:, 0], tiny.batch(agent.spec)._replace(context=None))
+    timestep = TimeStep(batch.obs, batch.reward, batch.is_first, batch.is_last, batch.is_terminal)
     policy, action = agent.act(state.params, agent.init_policy(2), timestep, jax.random.key(3), mode="mode")
     feature = jnp.concatenate([policy.latent.stoch.reshape(2, -1), policy.latent.deter], -1)
     np.testing.assert_allclose(agent.heads(state.params, feature).action, action, rtol=1e-4, atol=1e-5)

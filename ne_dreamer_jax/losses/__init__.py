@@ -6,14 +6,14 @@ value a step (KL, two-hot, actor, critic) leave the mean to the caller; `barlow_
 statistics of the whole batch and return a scalar.
 """
 
-from ne_dreamer_jax.losses.actor_critic import critic_loss, dynamics_loss, reinforce_loss
-from ne_dreamer_jax.losses.alignment import cosine_alignment, vicreg
-from ne_dreamer_jax.losses.barlow import barlow_twins, next_embedding_loss
-from ne_dreamer_jax.losses.kl import balanced_kl, categorical_kl, unimix_logits
-from ne_dreamer_jax.losses.reconstruction import image_loss, vector_loss
-from ne_dreamer_jax.losses.returns import lambda_returns, return_scale, update_percentiles
-from ne_dreamer_jax.losses.swav import assignment_loss, sinkhorn
-from ne_dreamer_jax.losses.twohot import symexp, symexp_bins, symlog, twohot_encode, twohot_loss, twohot_mean
+from .actor_critic import critic_loss, dynamics_loss, reinforce_loss
+from .alignment import cosine_alignment, vicreg
+from .barlow import barlow_twins, next_embedding_loss
+from .kl import balanced_kl, categorical_kl, unimix_logits
+from .reconstruction import image_loss, vector_loss
+from .returns import lambda_returns, return_scale, update_percentiles
+from .swav import assignment_loss, sinkhorn
+from .twohot import symexp, symexp_bins, symlog, twohot_encode, twohot_loss, twohot_mean
 
 __all__ = [
     "assignment_loss",

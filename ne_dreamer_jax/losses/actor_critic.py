@@ -9,7 +9,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.losses.twohot import twohot_loss
+from ._shapes import expect_leading, expect_same
+from .twohot import twohot_loss
 
 
 def reinforce_loss(
@@ -31,8 +32,12 @@ def reinforce_loss(
     Returns:
       float32 ``[...]``.
 
+    Raises:
+      ValueError: where the shapes do not agree.
+
     Source: NE-Dreamer and DreamerV3, eq. for the actor loss.
     """
+    expect_same(log_prob=log_prob, advantage=advantage, entropy=entropy, weight=weight)
     weight, advantage = jax.lax.stop_gradient((weight, advantage))
     objective = advantage.astype(jnp.float32) * log_prob.astype(jnp.float32)
     return -weight.astype(jnp.float32) * (objective + entropy_scale * entropy.astype(jnp.float32))
@@ -58,8 +63,12 @@ def dynamics_loss(
     Returns:
       float32 ``[...]``.
 
+    Raises:
+      ValueError: where the shapes do not agree.
+
     Source: NE-Dreamer, "Actor-Critic Learning" (text); Dreamer (Hafner et al., 2020).
     """
+    expect_same(normalized_return=normalized_return, entropy=entropy, weight=weight)
     weight = jax.lax.stop_gradient(weight).astype(jnp.float32)
     return -weight * (normalized_return.astype(jnp.float32) + entropy_scale * entropy.astype(jnp.float32))
 
@@ -90,7 +99,11 @@ def critic_loss(
     Returns:
       float32 ``[...]``.
 
+    Raises:
+      ValueError: where the shapes do not agree.
+
     Source: NE-Dreamer, eq. for the critic loss; DreamerV3 for the regulariser.
     """
+    expect_leading("logits", logits.shape, returns=returns, slow_value=slow_value, weight=weight)
     loss = twohot_loss(logits, returns, bins) + slow_scale * twohot_loss(logits, slow_value, bins)
     return jax.lax.stop_gradient(weight).astype(jnp.float32) * loss

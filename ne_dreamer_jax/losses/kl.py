@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from ._shapes import expect_same
+
 
 def unimix_logits(logits: jax.Array, mix: float = 0.01) -> jax.Array:
     """Normalised log-probabilities of ``(1 - mix) * softmax(logits) + mix / K``.
@@ -35,7 +37,11 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
 
     Returns:
       float32 ``[...]``, in nats.
+
+    Raises:
+      ValueError: where the shapes do not agree.
     """
+    expect_same(p_logits=p_logits, q_logits=q_logits)
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
     return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
@@ -66,7 +72,11 @@ def balanced_kl(
     Returns:
       ``(dynamics, representation)``, each float32 ``[...]``, in nats; the mean is the caller's. Their values are
       equal, their gradients are not.
+
+    Raises:
+      ValueError: where the shapes do not agree.
     """
+    expect_same(posterior_logits=posterior_logits, prior_logits=prior_logits)
     posterior = unimix_logits(posterior_logits, unimix)
     prior = unimix_logits(prior_logits, unimix)
     dynamics = jnp.sum(categorical_kl(jax.lax.stop_gradient(posterior), prior), axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from ne_dreamer_jax.losses.twohot import symlog
+from .twohot import symlog
 
 
 def image_loss(predicted: jax.Array, image: jax.Array) -> jax.Array:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from ._shapes import expect_same
+
 
 def lambda_returns(
     reward: jax.Array,
@@ -47,9 +49,9 @@ def lambda_returns(
 
     Source: NE-Dreamer, eq. for :math:`R^\lambda_t`; DreamerV3, eq. for the same; Sutton and Barto (2018), 12.1.
     """
-    shapes = [x.shape for x in (reward, value, discount, is_last) if x is not None]
-    if len(set(shapes)) != 1 or reward.ndim < 1 or reward.shape[-1] < 2:
-        raise ValueError(f"expected arrays of one shape [..., H + 1] with H >= 1, got {shapes}")
+    expect_same(reward=reward, value=value, discount=discount, **({} if is_last is None else {"is_last": is_last}))
+    if reward.ndim < 1 or reward.shape[-1] < 2:
+        raise ValueError(f"expected a reward of shape [..., H + 1] with H >= 1, got {reward.shape}")
     reward, value, discount = (x[..., 1:].astype(jnp.float32) for x in (reward, value, discount))
     chain = jnp.full_like(value, lam)
     if is_last is not None:

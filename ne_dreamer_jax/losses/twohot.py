@@ -94,7 +94,10 @@ def twohot_loss(logits: jax.Array, target: jax.Array, bins: jax.Array) -> jax.Ar
       ValueError: where the shapes do not agree.
     """
     if logits.shape != (*target.shape, *bins.shape):
-        raise ValueError(f"expected logits of shape {(*target.shape, *bins.shape)} [..., K], got {logits.shape}")
+        raise ValueError(
+            f"expected logits of shape {(*target.shape, *bins.shape)}, for a target {target.shape} and bins {bins.shape}, "
+            f"got {logits.shape}"
+        )
     weights = twohot_encode(jax.lax.stop_gradient(target), bins)
     logits = logits.astype(jnp.float32)
     # The weights sum to one, so the normaliser comes out of the sum, and no array of log-probabilities is needed.

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.envs import dmc
 from ne_dreamer_jax.envs.config import DmcConfig
-from ne_dreamer_jax.envs import dmc, registry
+from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.loop import Evaluation, random_action
 from ne_dreamer_jax.types import Array, Params, TimeStep
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import jax
 
-from ne_dreamer_jax.runs.schedule import Schedule
-from ne_dreamer_jax.system import memory
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.loop import Loop, LoopState
 from ne_dreamer_jax.runs.metrics import StepCounts
+from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.system import memory
 
 NOTHING_LEARNED = (
     "Nothing is learned in this run: it has no update. Raise loop.env_steps (--env-steps), or lower loop.prefill, the "

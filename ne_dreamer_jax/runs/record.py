@@ -8,13 +8,12 @@ from typing import Any
 
 import jax
 
-from ne_dreamer_jax.runs import checkpoint
-from ne_dreamer_jax.runs import metrics
-from ne_dreamer_jax.system import parallel
-from ne_dreamer_jax.replay.host_frames import HostFrames
 from ne_dreamer_jax.loop import LoopState
+from ne_dreamer_jax.replay.host_frames import HostFrames
+from ne_dreamer_jax.runs import checkpoint, metrics
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.run_directory import RunDirectory
+from ne_dreamer_jax.system import parallel
 
 
 def whole(frames: HostFrames | None) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,30 +19,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from ne_dreamer_jax.runs import pictures
-from ne_dreamer_jax.runs import plots
-from ne_dreamer_jax.runs import progress
-from ne_dreamer_jax.runs import video
-from ne_dreamer_jax.runs.run_directory import typed
-from ne_dreamer_jax.runs.record import Record, Saves, whole
-from ne_dreamer_jax.runs.schedule import Schedule
-from ne_dreamer_jax.runs.signals import Stop
-from ne_dreamer_jax.runs import checkpoint
-from ne_dreamer_jax.system import compile_cache
-from ne_dreamer_jax.runs import metrics
-from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.agents import make_agent
 from ne_dreamer_jax.agents.base import Agent
-from ne_dreamer_jax.types import images_of
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import OwnConfig
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
+from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, video
 from ne_dreamer_jax.runs.metrics import StepCounts
-from ne_dreamer_jax.runs.run_directory import RunDirectory
+from ne_dreamer_jax.runs.record import Record, Saves, whole
+from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
+from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.runs.signals import Stop
+from ne_dreamer_jax.system import compile_cache, parallel
+from ne_dreamer_jax.types import images_of
 
 Echo = Callable[[str], None]
 
@@ -148,7 +141,9 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
-        pictures.attempt(lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo)
+        pictures.attempt(
+            lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
+        )
     draw(run, files, record, echo)
     for line in _conclusion(run, files, record):
         echo(line)

@@ -1,0 +1,23 @@
+"""One run on disk: its directory, metrics, checkpoints, pictures, and the service that trains it."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=[
+        "api",
+        "checkpoint",
+        "evaluation",
+        "metrics",
+        "pictures",
+        "plots",
+        "progress",
+        "record",
+        "run_directory",
+        "schedule",
+        "signals",
+        "training",
+        "video",
+    ],
+    submod_attrs={"api": ["Outcome", "train"], "evaluation": ["Loaded", "evaluate", "load"]},
+)

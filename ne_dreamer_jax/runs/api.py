@@ -1,0 +1,66 @@
+"""One call that trains, for people who write their experiments in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jax.sharding import Mesh
+
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.runs import progress, run_directory, training
+from ne_dreamer_jax.runs.evaluation import own
+from ne_dreamer_jax.runs.run_directory import RunDirectory
+from ne_dreamer_jax.system import compile_cache
+from ne_dreamer_jax.system.quiet import quiet
+
+
+class Outcome(NamedTuple):
+    """How a call of `train` ended."""
+
+    files: RunDirectory
+    """Where everything lies."""
+    code: int
+    """0 when the run is finished, 128 + the signal's number when it was stopped by one."""
+
+
+def train(
+    config: Config,
+    logdir: str | Path,
+    env: Any = None,
+    *,
+    checkpoint_minutes: float = 15.0,
+    mesh: Mesh | None = None,
+    echo: Callable[[str], None] = print,
+) -> Outcome:
+    """Trains an agent, with all that the command has: checkpoints, metrics, evaluations, pictures, resuming.
+
+    Called again with the same configuration and directory it goes on, and ends with the same bits.
+
+    Args:
+      config: what to train; see `config.preset`.
+      logdir: the run's directory, made if need be.
+      env: an environment of one's own, an ``envs.base.Env`` (``env.spec``, ``env.reset``, ``env.step``, ...; see
+        ``envs.base.from_core``), in place of the one that the configuration names. The run's ``config.json`` then says
+        that the environment was given in code: to go on and to evaluate, give it again.
+      checkpoint_minutes: time between checkpoints.
+      mesh: of ``system.parallel.make_mesh``, to train on several devices.
+      echo: takes the lines for people; ``lambda line: None`` for none.
+
+    Raises:
+      ValueError: settings that do not fit each other, the environment or the memory.
+      RefusedError: the directory holds another run, or anything else, or is in use.
+      DamagedError: there are checkpoints, and none that can be used.
+    """
+    quiet()
+    path = Path(logdir).expanduser()
+    config = own(config, env)
+    run_directory.check(path)
+    run_directory.check_same(path, config)
+    compile_cache.enable()
+    run = training.build(config, env, mesh)
+    for line in progress.describe(config, run.loop, run.shapes):
+        echo(line)
+    with run_directory.claim(path, config) as files:
+        return Outcome(files, training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo))

@@ -1,0 +1,160 @@
+"""A finished or stopped run, loaded again: to act with it, and to play episodes with its policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from ne_dreamer_jax.agents import make_agent
+from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs import config as env_configs
+from ne_dreamer_jax.envs.config import OwnConfig
+from ne_dreamer_jax.envs.vector import VectorEnv, vectorize
+from ne_dreamer_jax.loop.play import Evaluation, make_play
+from ne_dreamer_jax.runs import checkpoint, pictures, run_directory, video
+from ne_dreamer_jax.runs.run_directory import RunDirectory
+from ne_dreamer_jax.types import Array
+
+Prefer = Literal["best", "newest"]
+EVALUATION = 0x65_76_61_6C
+"""Sets these episodes apart from those of a run with the same seed."""
+
+
+class Loaded(NamedTuple):
+    """A run's agent with what it learned, and its environment."""
+
+    config: Config
+    env: Any  # `envs.base.Env` or `VectorEnv`
+    agent: Agent
+    state: Any  # the agent's train state; ``state.params`` is what ``agent.act`` takes
+    checkpoint: checkpoint.Checkpoint
+    skipped: tuple[str, ...]  # damaged checkpoints that were passed over, a reason each
+
+
+def load(run: str | Path, env: Any = None, prefer: Prefer = "best") -> Loaded:
+    """The agent of a run directory. Neither replay nor the environments' states are read.
+
+    Args:
+      run: the run's directory.
+      env: the environment, for a run that was trained on one given in code.
+      prefer: the checkpoint with the best evaluation during training, or the newest.
+
+    Raises:
+      RefusedError: there is no run, or one of another version.
+      ValueError: the run's environment has no name and none is given, or the one that is given does not fit the agent.
+      FileNotFoundError, DamagedError: there is no checkpoint, or none that can be used.
+    """
+    path = Path(run)
+    config = run_directory.read_config(path, Config)
+    if env is None:
+        env = env_configs.make(config.env)
+    elif not isinstance(config.env, OwnConfig):
+        raise ValueError(
+            f"{path} is a run of {config.env.task}; expected no other environment for it. To see how its agent does "
+            "elsewhere, load it without env, and step the other environment with loaded.agent.act"
+        )
+    agent = make_agent(config.agent, env.spec)
+    like = jax.eval_shape(agent.init, jax.random.key(0))
+    restored = checkpoint.restore(RunDirectory(path).checkpoints, {"agent": like}, prefer=prefer)
+    return Loaded(config, env, agent, restored.items["agent"], restored.checkpoint, tuple(restored.skipped))
+
+
+def vector_of(env: Any) -> VectorEnv:
+    """N environments at once of a single one; what is of that kind already stays as it is."""
+    return env if isinstance(env, VectorEnv) else vectorize(env)
+
+
+def evaluate(
+    run: str | Path,
+    env: Any = None,
+    *,
+    episodes: int = 10,
+    prefer: Prefer = "best",
+    seed: int = 0,
+    with_video: bool = False,
+    echo: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Plays episodes with the policy of a run, beside a random policy's, and stores what came out.
+
+    Args:
+      run, env, prefer: as for `load`, with its errors.
+      episodes: M, played together.
+      seed: of the episodes' beginnings.
+      with_video: whether to write the first episode to ``policy.mp4``.
+      echo: takes the lines for people.
+
+    Returns:
+      What ``evaluation.json`` holds: ``task``, ``env_step``, ``episodes``, ``seed``, and for ``policy`` and ``random``
+      the ``mean``, ``std``, ``returns`` and ``lengths``, and the number ``unfinished`` at ``loop.eval_max_steps``.
+    """
+    loaded = load(run, env, prefer)
+    content = head(loaded, episodes, seed, echo)
+    venv = vector_of(loaded.env)
+    play = make_play(venv, loaded.agent, loaded.config.loop.eval_max_steps)
+    files = RunDirectory(Path(run))
+    for name, key in keys(seed).items():
+        evaluation = play(loaded.state.params, key, episodes, random=name == "random", frames=with_video)
+        content[name] = summary(evaluation)
+        echo(line(name, evaluation))
+        if with_video and name == "policy":
+            _video(evaluation, files, venv.step_seconds, echo)
+    run_directory.write_evaluation(files, content)
+    return content
+
+
+def head(loaded: Loaded, episodes: int, seed: int, echo: Callable[[str], None]) -> dict[str, Any]:
+    """Says which checkpoint is evaluated; the result's first entries."""
+    for reason in loaded.skipped:
+        echo(f"Passed over a damaged checkpoint: {reason}")
+    config, found = loaded.config, loaded.checkpoint
+    echo(f"{config.env.task}, {config.method}, after {found.step:,} environment steps ({found.path})")
+    return {"task": config.env.task, "env_step": found.step, "episodes": episodes, "seed": seed}
+
+
+def keys(seed: int) -> dict[str, Array]:
+    """The keys of the policy's episodes, and of the random policy's."""
+    policy_key, random_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), EVALUATION))
+    return {"policy": policy_key, "random": random_key}
+
+
+def summary(evaluation: Evaluation) -> dict[str, Any]:
+    """Returns and lengths as what `json.dumps` takes."""
+    returns = np.asarray(evaluation.returns, np.float64)
+    return {
+        "mean": float(returns.mean()),
+        "std": float(returns.std()),
+        "returns": [float(value) for value in returns],
+        "lengths": [int(value) for value in evaluation.lengths],
+        "unfinished": evaluation.unfinished,
+    }
+
+
+def line(name: str, evaluation: Evaluation, where: str = "") -> str:
+    """An evaluation in words."""
+    returns = np.asarray(evaluation.returns, np.float64)
+    open_end = f", {evaluation.unfinished} of them not ended" if evaluation.unfinished else ""
+    return f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {len(returns)} episodes{open_end}{where}"
+
+
+def _video(
+    evaluation: Evaluation, files: RunDirectory, step_seconds: float | None, echo: Callable[[str], None]
+) -> None:
+    if evaluation.frames is None:
+        echo("no video: this agent sees vectors, not pixels")
+        return
+    write = lambda: video.write(evaluation.frames, files.video, fps=video.frame_rate(step_seconds))
+    if pictures.attempt(write, files.video, echo):
+        echo(f"{files.video} shows the first episode")
+
+
+def own(config: Config, env: Any) -> Config:
+    """The configuration of a run on an environment that is given as an object: it says so."""
+    if env is None or isinstance(config.env, OwnConfig):
+        return config
+    return replace(config, env=OwnConfig(action_repeat=config.env.action_repeat))
