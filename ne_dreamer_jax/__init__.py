@@ -23,6 +23,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "agents": ["Agent", "AgentConfig", "make_agent"],
         "envs": ["register"],
+        "version": ["__version__"],
         "runs": ["checkpoint", "evaluate", "load", "metrics", "run_directory", "train"],
     },
 )

@@ -4,7 +4,7 @@ import jax
 
 
 def expect_same(**arrays: jax.Array) -> None:
-    """Raises ValueError unless all have one shape; the message names them as the caller knows them, with their shapes."""
+    """Raises ValueError unless all have one shape; the message has the caller's names for them, and their shapes."""
     shapes = {name: tuple(array.shape) for name, array in arrays.items()}
     if len(set(shapes.values())) > 1:
         got = ", ".join(f"{name} {shape}" for name, shape in shapes.items())

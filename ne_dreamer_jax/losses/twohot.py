@@ -95,8 +95,8 @@ def twohot_loss(logits: jax.Array, target: jax.Array, bins: jax.Array) -> jax.Ar
     """
     if logits.shape != (*target.shape, *bins.shape):
         raise ValueError(
-            f"expected logits of shape {(*target.shape, *bins.shape)}, for a target {target.shape} and bins {bins.shape}, "
-            f"got {logits.shape}"
+            f"expected logits of shape {(*target.shape, *bins.shape)}, for a target {target.shape} and bins "
+            f"{bins.shape}, got {logits.shape}"
         )
     weights = twohot_encode(jax.lax.stop_gradient(target), bins)
     logits = logits.astype(jnp.float32)

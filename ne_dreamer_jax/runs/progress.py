@@ -24,18 +24,19 @@ NOTHING_LEARNED = (
 
 def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
     """The budget of a run in plain words, a line each."""
-    schedule = Schedule.of(config, loop)
     agent, options = config.agent, config.loop
     counts = parameter_counts(shapes.train.params)
     modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
-    agent_steps = schedule.total * schedule.num_envs
+    budget = loop.budget
+    env_steps = f"{budget.agent_steps * budget.action_repeat:,} environment steps"
+    first = f"{budget.prefill * budget.num_envs:,} agent steps"
     lines = [
         f"{config.env.task} from {_seen(config)}, {config.method}, seed {config.seed}, on {_devices(shapes)}",
-        f"  budget    {agent_steps * schedule.action_repeat:,} environment steps: {agent_steps:,} agent steps "
-        f"(action repeat {schedule.action_repeat}) in {schedule.num_envs} environments",
-        f"  learning  {loop.budget.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
-        f"{loop.budget.prefill * loop.budget.num_envs:,} agent steps; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
-        f"  memory    replay holds {loop.budget.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
+        f"  budget    {env_steps}: {budget.agent_steps:,} agent steps "
+        f"(action repeat {budget.action_repeat}) in {budget.num_envs} environments",
+        f"  learning  {budget.updates:,} updates of {agent.batch_size} x {agent.batch_length} steps, the first after "
+        f"{first}; replay ratio {options.replay_ratio:g} (how often a step is learned from)",
+        f"  memory    replay holds {budget.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]
     return lines if loop.budget.updates or options.replay_ratio == 0 else [*lines, f"  WARNING   {NOTHING_LEARNED}"]
