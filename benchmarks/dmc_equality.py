@@ -134,6 +134,34 @@ class Player:
         return np.stack(rewards), jax.tree.map(lambda *values: np.stack(values), *observations)
 
 
+class TrainingPlayer(Player):
+    """The same through the environment, from where training begins: ``prepare`` and ``step``. Of 32 bits."""
+
+    def __init__(self, task: Task, action_repeat: int = 2):
+        super().__init__(task)
+        env = base.from_core(environment.make_core(task, "vector", action_repeat, image_size=64))
+        self._prepare, self._step = jax.vmap(env.prepare), jax.jit(jax.vmap(env.step))
+
+    def play(
+        self, start: Arrays, episode: Episode, actions: np.ndarray, action_repeat: int = 2
+    ) -> tuple[np.ndarray, Arrays]:
+        """As `Player.play`; the states are put in the place of those that the environments' first step has drawn."""
+        count = len(start["time"])
+        first, none = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (start, np.zeros(actions.shape[1:])))
+        state, _ = self._step(self._prepare(jax.random.split(jax.random.key(0), count)), none)
+        control = jnp.zeros((count, len(self._low)), jnp.float32)
+        physics = self._advance(state.physics, control, jnp.ones(count, bool), first)
+        episode = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), episode)
+        longest = jnp.full((count,), 2**30, jnp.int32)
+        state = state._replace(core=state.core._replace(physics=physics, episode=episode, steps_left=longest))
+        rewards, observations = [], []
+        for action in actions:
+            state, timestep = self._step(state, jnp.asarray(action, jnp.float32))
+            rewards.append(np.asarray(timestep.reward))
+            observations.append(jax.tree.map(np.asarray, dict(timestep.obs)))
+        return np.stack(rewards), jax.tree.map(lambda *values: np.stack(values), *observations)
+
+
 def error(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Absolute error where ``theirs`` is below 1, relative error above; the largest over all but the first axis."""
     ours, theirs = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
@@ -257,11 +285,13 @@ class Row(NamedTuple):
 def measure(name: str, steps: int, free_steps: int, runs: int, resets: int, episodes: int, fast: bool = False) -> Row:
     """All of one task; a size of 0 skips that column."""
     task = load_task(name, fast)
-    player = Player(task)  # compiles its physics once, for batches of as many as there are free runs
+    # Compiles its physics once, for batches of as many as there are free runs. Environments are of 32 bits.
+    player = Player(task) if jax.config.read("jax_enable_x64") else TrainingPlayer(task)
     reward_errors, obs_errors = one_step_errors(player, record(name, steps), runs or None)
     if not all(np.isfinite(errors).all() for errors in (reward_errors, *obs_errors.values())):
         raise AssertionError(f"{name}: expected finite rewards and observations")
     worst = max(obs_errors, key=lambda key: obs_errors[key].max())
+    # The environment itself, as training steps it.
     agreement = int(np.median(free_run(name, player, free_steps, runs))) if free_steps and runs else None
     p_values = reset_p_values(our_resets(task, resets), their_resets(name, resets)) if resets else None
     ours = our_returns(task, episodes) if episodes else None

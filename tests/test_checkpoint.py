@@ -40,9 +40,7 @@ def bits(tree: Any) -> list[tuple[Any, ...]]:
 
 
 def save(directory, step, score=None):
-    return checkpoint.save(
-        directory, step, {"agent": make(step).params, "loop": make(step)}, score=score, notes={"done": step}
-    )
+    return checkpoint.save(directory, step, {"agent": make(step).params, "loop": make(step)}, score=score)
 
 
 LIKE = {"agent": make().params, "loop": make()}
@@ -66,7 +64,7 @@ def test_every_bit_comes_back(tmp_path, abstract):
     assert bits(restored.items["loop"]) == bits(make(3))
     assert jax.tree.structure(restored.items["loop"]) == jax.tree.structure(make(3))
     assert restored.skipped == []
-    assert (restored.checkpoint.step, restored.checkpoint.notes) == (3, {"done": 3})
+    assert restored.checkpoint.step == 3
 
 
 def test_restored_arrays_may_be_donated(tmp_path):

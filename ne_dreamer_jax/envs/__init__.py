@@ -7,12 +7,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import lazy_loader
+
 from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.envs.registry import check, names, register
 
 if TYPE_CHECKING:
     from ne_dreamer_jax.envs.base import Env
 
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__, submodules=["base", "config", "conformance", "dmc", "probes", "registry", "vector"]
+)
 __all__ = ["check", "make", "names", "register"]
 
 

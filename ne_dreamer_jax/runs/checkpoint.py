@@ -4,7 +4,7 @@ A checkpoint holds one or more named items (training saves "agent", the train st
 else, so that an evaluation never reads the replay; and "frames", images on the host, if there are any)::
 
     checkpoints/000000123456/        one checkpoint; the number is the step it was saved at
-      manifest.json                  step, score, the caller's notes; of each item: the name, shape, dtype and SHA-256
+      manifest.json                  step, score; of each item: the name, shape, dtype and SHA-256
                                      of every array, and the SHA-256 of every file; and a SHA-256 of all that
       agent/  loop/  frames/         the items, written by Orbax; numpy's arrays by numpy, which needs no copy
 
@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -27,6 +26,8 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+
+from ne_dreamer_jax.files import sync_file, write_text
 
 MANIFEST = "manifest.json"
 FORMAT = 2
@@ -43,7 +44,6 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     score: float | None  # the evaluation return at this step, where there was an evaluation
-    notes: dict[str, Any]  # what the caller wished to keep beside it
     items: dict[str, dict[str, dict[str, Any]]]  # item -> name of an array -> shape, dtype, sha256
     files: dict[str, dict[str, str]]  # item -> path of a file in the item's folder -> sha256
 
@@ -62,7 +62,6 @@ def save(
     items: Mapping[str, Any],
     *,
     score: float | None = None,
-    notes: Mapping[str, Any] | None = None,
 ) -> Checkpoint:
     """Saves pytrees of arrays; returns when they are on disk.
 
@@ -72,7 +71,6 @@ def save(
       items: name -> pytree whose leaves are arrays; typed PRNG keys are arrays too. Arrays that are divided over
         processes must be gathered first.
       score: the evaluation return at this step, by which `prune` and `restore` find the best.
-      notes: what `json.dumps` takes.
 
     Raises:
       TypeError: a leaf that is no array.
@@ -100,19 +98,18 @@ def save(
         "format": FORMAT,
         "step": step,
         "score": None if score is None or not math.isfinite(score) else float(score),
-        "notes": dict(notes or {}),
         "items": described,
         "files": files,
     }
     _write_manifest(partial, content)
     for path in [*partial.rglob("*"), partial]:
-        _sync(path)
+        sync_file(path)
     final = directory / f"{step:012d}"
     if final.exists():
         # Aside first, so that at no time a checkpoint stands half removed under its own name.
         final.rename(directory / f"{_PARTIAL}old-{step:012d}")
     partial.rename(final)
-    _sync(directory)
+    sync_file(directory)
     _remove_partial(directory)
     return _read_manifest(final)
 
@@ -219,19 +216,9 @@ def _remove_partial(directory: Path) -> None:
         shutil.rmtree(path)
 
 
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _write_manifest(folder: Path, content: dict[str, Any]) -> None:
-    beside = folder / f"{MANIFEST}.partial"
-    beside.write_text(json.dumps({**content, "sha256": _digest_json(content)}, indent=1))
-    _sync(beside)
-    os.replace(beside, folder / MANIFEST)
+    text = json.dumps({**content, "sha256": _digest_json(content)}, indent=1)
+    write_text(folder / MANIFEST, text, sync=True)
 
 
 def _read_manifest(folder: Path) -> Checkpoint:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
+
+from ne_dreamer_jax.files import replacing
 
 COUNTERS = ("env_step", "agent_step", "update")
 
@@ -98,13 +99,10 @@ def resume(path: Path, env_step: int) -> list[dict[str, Any]]:
     The file is replaced whole, so that it never stands half written.
     """
     kept = [line for line in read(path) if line["env_step"] <= env_step]
-    beside = path.with_name(path.name + ".partial")
-    beside.unlink(missing_ok=True)
-    with Writer(beside) as writer:
+    with replacing(path) as beside, Writer(beside) as writer:
         for line in kept:
             values = {name: value for name, value in line.items() if name not in COUNTERS}
             writer.write(StepCounts(*(line[counter] for counter in COUNTERS)), values)
-    os.replace(beside, path)
     return kept
 
 

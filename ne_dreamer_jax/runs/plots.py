@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ne_dreamer_jax.files import replacing
 from ne_dreamer_jax.runs import metrics
 
 if TYPE_CHECKING:
@@ -124,16 +125,12 @@ def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
     finally:
         if backend is not None:
             os.environ["MPLBACKEND"] = backend
-    beside = path.with_name(path.name + ".partial")
     with matplotlib.style.context("default"):
         figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         yield figure.subplots()
-        try:
+        with replacing(path) as beside:
             canvas.print_figure(beside, format="png")
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
 
 
 def _train(axes: Axes, steps: np.ndarray, returns: np.ndarray) -> None:

@@ -99,6 +99,6 @@ class Saves:
             items = parallel.gather(items)
             if jax.process_index() > 0:
                 return
-        checkpoint.save(self._directory, counters.env_step, items, score=score, notes=counters._asdict())
+        checkpoint.save(self._directory, counters.env_step, items, score=score)
         checkpoint.prune(self._directory, whole=self._items)
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ne_dreamer_jax.files import replacing
+
 WIDTH = 384  # pixels that a video has at least, in whole multiples of the frames' own
 PATIENCE = 600.0  # seconds that ffmpeg may take
 
@@ -42,19 +44,16 @@ def write(frames: np.ndarray | None, path: Path, *, fps: float) -> None:
     scale = max(1, -(-WIDTH // width))
     if height * scale % 2 or width * scale % 2:
         scale += 1  # even sides: H.264 shares colour among 2 x 2 pixels
-    beside = path.with_name("partial-" + path.name)  # ffmpeg goes by the suffix
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
     command += ["-vf", f"scale={width * scale}:{height * scale}:flags=neighbor", "-pix_fmt", "yuv420p"]
-    command += ["-c:v", "libx264", "-crf", "18", "-movflags", "+faststart", os.path.abspath(beside)]
-    try:
-        done = subprocess.run(command, input=frames.tobytes(), capture_output=True, check=False, timeout=PATIENCE)
+    command += ["-c:v", "libx264", "-crf", "18", "-movflags", "+faststart"]
+    with replacing(path) as beside:
+        whole = [*command, os.path.abspath(beside)]
+        done = subprocess.run(whole, input=frames.tobytes(), capture_output=True, check=False, timeout=PATIENCE)
         if done.returncode:
             how = f"exit code {done.returncode}" if done.returncode > 0 else f"ended by signal {-done.returncode}"
             raise RuntimeError(f"ffmpeg failed, {how}: {done.stderr.decode(errors='replace').strip()}")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def colours(frames: np.ndarray) -> np.ndarray:
