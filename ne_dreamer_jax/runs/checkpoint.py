@@ -227,6 +227,7 @@ def _read_manifest(folder: Path) -> Checkpoint:
         digest = content.pop("sha256")
         if digest != _digest_json(content):
             raise ValueError("its checksum does not hold")
+        content.pop("notes", None)  # which version 0.1 wrote
         if content.pop("format") != FORMAT:
             raise ValueError(f"expected format {FORMAT}; another version of this program wrote it")
         return Checkpoint(folder, **content)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ne_dreamer_jax import settings
+from ne_dreamer_jax.files import write_text
 
 C = TypeVar("C")
 MARKER = ".ne_dreamer_jax"
