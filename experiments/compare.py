@@ -32,6 +32,10 @@ LABELS = {"dreamerv3": "DreamerV3", "drqv2": "DrQ-v2"}
 Curve = tuple["np.ndarray", "np.ndarray"]
 
 
+REFUSED = 2
+"""Exit code of a command whose arguments do not fit, such as a method that can't act in the task."""
+
+
 class Found(NamedTuple):
     """A run that has been evaluated at least once."""
 
@@ -74,27 +78,52 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
             options += [] if value is None else [option, value]
         for assignment in assignments:
             options += ["--set", assignment]
-        if not only_draw:
-            for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
-                for method in chosen or methods:
-                    path = directory / method.replace("/", "-") / f"seed{seed}"
-                    if not finished(path):
-                        say(f"\n{method}, seed {seed}: {path}")
-                        train(path, [*options, "--method", method, "--seed", str(seed)])
+        failed = {} if only_draw else train_missing(directory, chosen or methods, seeds, options)
         with refusing(run_directory.RefusedError, ValueError):
             found = find(directory)
             for line in draw(found, directory / "comparison.png"):
                 say(line)
+        for (method, seed), code in failed.items():
+            why = "refused (its message stands above)" if code == REFUSED else f"exit code {code}"
+            say(f"  {method}, seed {seed}, is missing: {why}")
+        if failed:
+            raise SystemExit(next(iter(failed.values())))
 
     return main
 
 
-def train(path: Path, options: Sequence[str]) -> None:
-    """One run, in a process of its own; ends this one where it fails or is stopped."""
+def train_missing(
+    directory: Path, methods: Sequence[str], seeds: int, options: Sequence[str]
+) -> dict[tuple[str, int], int]:
+    """Trains what is not finished yet, and goes on where a run fails.
+
+    A method that can't act in the task is refused once, not for every seed.
+
+    Returns:
+      (method, seed) -> exit code, of the runs that failed.
+
+    Raises:
+      SystemExit: a run was stopped by a signal, and so is this process.
+    """
+    failed: dict[tuple[str, int], int] = {}
+    for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
+        for method in methods:
+            path = directory / method.replace("/", "-") / f"seed{seed}"
+            if finished(path) or failed.get((method, 0)) == REFUSED:
+                continue
+            say(f"\n{method}, seed {seed}: {path}")
+            code = train(path, [*options, "--method", method, "--seed", str(seed)])
+            if code < 0 or code > 128:
+                raise SystemExit(code)
+            if code:
+                failed[method, seed] = code
+    return failed
+
+
+def train(path: Path, options: Sequence[str]) -> int:
+    """One run, in a process of its own; its exit code."""
     arguments = [sys.executable, "-m", "ne_dreamer_jax", "train", *options, "--logdir", as_argument(path)]
-    code = subprocess.run(arguments, check=False).returncode
-    if code:
-        raise SystemExit(code)
+    return subprocess.run(arguments, check=False).returncode
 
 
 def finished(path: Path) -> bool:

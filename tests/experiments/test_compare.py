@@ -11,6 +11,7 @@ from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.settings import names
 
 BUDGET = 400
+FAILING: dict[str, int] = {}  # method -> exit code of its runs
 
 
 def write(path, options, upto=BUDGET):
@@ -31,7 +32,10 @@ def invoke(monkeypatch):
 
     def train(path, options):
         started.append((path.parent.name, path.name))
-        write(path, options)
+        code = FAILING.get(path.parent.name, 0)
+        if not code:
+            write(path, options)
+        return code
 
     monkeypatch.setattr(compare, "train", train)
 
@@ -67,6 +71,28 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, invoke):
     assert "1 unfinished" in output
     _, _, started = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
     assert started == [("r2dreamer", "seed0")]
+
+
+def test_a_method_that_fails_ends_no_other_and_is_named(tmp_path, invoke, monkeypatch):
+    """One that can't act in the task is refused once; one that broke down is tried with every seed."""
+    monkeypatch.setitem(FAILING, "drqv2", 2)
+    monkeypatch.setitem(FAILING, "dreamerv3", 1)
+    chosen = [word for name in ("drqv2", "dreamerv3", "r2dreamer") for word in ("--method", name)]
+    code, output, started = invoke(compare, tmp_path, *chosen, "--seeds", 2)
+    assert code == 2
+    assert started == [
+        (m, f"seed{s}") for s in (0, 1) for m in ("drqv2", "dreamerv3", "r2dreamer") if (m, s) != ("drqv2", 1)
+    ]
+    assert "drqv2, seed 0, is missing: refused" in output
+    assert "dreamerv3, seed 1, is missing: exit code 1" in output
+    assert "r2dreamer" in output.split("comparison.png")[0]
+
+
+def test_a_signal_ends_the_comparison(tmp_path, invoke, monkeypatch):
+    monkeypatch.setitem(FAILING, "dreamerv3", 130)
+    code, _, started = invoke(compare, tmp_path, "--method", "dreamerv3", "--method", "r2dreamer", "--seeds", 1)
+    assert code == 130
+    assert started == [("dreamerv3", "seed0")]
 
 
 def test_the_ablations_are_the_papers(tmp_path, invoke):
