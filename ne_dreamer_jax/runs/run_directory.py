@@ -158,8 +158,13 @@ def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
         if not files.config.exists():
             marker.write(_MARKER_TEXT)
             marker.flush()
-            _write_json(files.config, settings.to_dict(config))
+            store_config(files, config)
         yield files
+
+
+def store_config(files: RunDirectory, config: Any) -> None:
+    """Writes the configuration, in place of what stood there."""
+    _write_json(files.config, settings.to_dict(config))
 
 
 def read_config(path: Path, cls: type[C]) -> C:

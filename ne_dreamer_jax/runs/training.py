@@ -28,7 +28,7 @@ from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import OwnConfig
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
-from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, video
+from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record, Saves, whole
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
@@ -60,7 +60,7 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
 
     Args:
       env: what to train in, instead of the environment that the configuration names.
-      mesh: of `ne_dreamer_jax.parallel`, to train on several devices.
+      mesh: of `system.parallel`, to train on several devices.
 
     Raises:
       ValueError: what does not fit together, or not into memory.
@@ -77,8 +77,8 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
 def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
     """Trains to the end of the budget, from the newest checkpoint if there is one.
 
-    Where a run has several processes, all of them call this. The first alone writes files, and what hangs on a clock, a
-    signal or a file is decided there.
+    Where a run has several processes, all of them call this. The main process alone writes files, and decides what
+    depends on a clock, a signal or a file.
 
     Args:
       files: of a directory that is claimed for this configuration; all processes must see the same.
@@ -92,6 +92,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
     """
     schedule = run.schedule
+    if parallel.is_main_process() and run.config.env == OwnConfig(action_repeat=run.config.env.action_repeat):
+        run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
     state, lines = _start(run, files, start_key, echo)
     counters = schedule.counters(state)
@@ -99,8 +101,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
     chunk: Any = None
     frames = None
-    first = jax.process_index() == 0
-    with metrics.Writer(files.metrics if first else Path(os.devnull)) as writer, Stop(echo) as stop:
+    is_main_process = parallel.is_main_process()
+    with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
         record = Record(writer, lines)
         while True:
             step = counters.agent_step // schedule.num_envs
@@ -111,7 +113,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
                 values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
-                if first:
+                if is_main_process:
                     draw(run, files, record, echo)
                 if step < schedule.total:  # at the end everything is saved below
                     saves.if_best(state, counters, record.score(counters))
@@ -135,7 +137,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
             return 128 + stopped_by
-    if not first:
+    if not is_main_process:
         return 0
     checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
     if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
@@ -201,7 +203,7 @@ def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
 
 def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
     """The state to go on from, and the metrics up to it."""
-    shapes, first = run.shapes, jax.process_index() == 0
+    shapes, is_main_process = run.shapes, parallel.is_main_process()
     if jax.process_count() > 1:  # each reads the whole and keeps its share
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
     apart: Any = ()
@@ -215,7 +217,7 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
         _same_for_all(files, -1)
         state = jax.block_until_ready(run.loop.init(key))
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
-        return state, metrics.resume(files.metrics, -1) if first else []
+        return state, metrics.resume(files.metrics, -1) if is_main_process else []
     for reason in restored.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
@@ -224,7 +226,7 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     if run.loop.frames is not None:
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
-    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if first else []
+    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if is_main_process else []
 
 
 def _same_for_all(files: RunDirectory, env_step: int) -> None:

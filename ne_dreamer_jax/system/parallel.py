@@ -38,6 +38,11 @@ def connect(coordinator: str, processes: int, process: int) -> None:
     jax.distributed.initialize(coordinator, processes, process)
 
 
+def is_main_process() -> bool:
+    """Whether this is the process that writes files and speaks to people."""
+    return jax.process_index() == 0
+
+
 def make_mesh(devices: int) -> Mesh:
     """A mesh of so many devices of each process. Raises ValueError where there are fewer."""
     here = jax.local_device_count()
