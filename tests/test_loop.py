@@ -258,7 +258,7 @@ def test_states_and_the_host_give_the_pixels_back():
         return loop, seen
 
     (pixels, want), (states, redrawn), (host, fetched) = map(last_batch, ("pixels", "states", "host"))
-    assert len(want) == pixels.updates > 3
+    assert len(want) == pixels.budget.updates > 3
     assert_same(redrawn, want)
     assert_same(fetched, want)
     assert want[0][0].shape == (2, 3, 8, 8, 3)

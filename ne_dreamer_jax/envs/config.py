@@ -12,7 +12,7 @@ from ne_dreamer_jax.settings.ranges import Range
 Repeat = Annotated[int, Range(1, 1_000_000)]
 ImageSize = Annotated[int, Range(1, 4_096)]
 
-GIVEN = "given in code"
+GIVEN = "an environment given in code"
 """The task of an environment that was passed as an object, and has no name."""
 
 

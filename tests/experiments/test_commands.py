@@ -13,9 +13,9 @@ from experiments import evaluate, train
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import envs, settings
 from ne_dreamer_jax.commands.train import FLAGS
-from ne_dreamer_jax.runs import run_directory, training
+from ne_dreamer_jax.runs import checkpoint, evaluation, run_directory, training
 from ne_dreamer_jax.settings import names
-from tests.experiments import stub
+from tests.experiments import stub, toy
 
 
 def invoke(command, *arguments):
@@ -26,7 +26,7 @@ def invoke(command, *arguments):
 
 
 MISTYPED = {
-    ("--task", "dmc/walker_wlak"): "no task is called 'dmc/walker_wlak'. Did you mean dmc/walker_walk",
+    ("--task", "dmc/walker_wlak"): "no environment is called 'dmc/walker_wlak'. Did you mean dmc/walker_walk",
     ("--method", "ne_dreamr"): "no method is called 'ne_dreamr'. Did you mean ne_dreamer",
     ("--preset", "quickstrat"): "no preset is called 'quickstrat'. Did you mean quickstart?",
     ("--size", "12"): "no size is called '12'. Did you mean 12m",
@@ -174,9 +174,20 @@ def trained(tmp_path_factory):
     return path
 
 
+def play_as(monkeypatch, run):
+    """Has the policies of stored runs played as this run plays."""
+
+    def load(path, env=None, prefer="best"):
+        found = checkpoint.restore(path / "checkpoints", {"agent": run.shapes.train}, prefer=prefer)
+        return evaluation.Loaded(run.config, toy.env(), run.agent, found.items["agent"], found.checkpoint, ())
+
+    monkeypatch.setattr(evaluation, "load", load)
+    monkeypatch.setattr(evaluation, "make_play", lambda env, agent, max_steps: run.loop.evaluate)
+
+
 @pytest.mark.parametrize("which", ["best", "newest"])
 def test_evaluate_plays_a_stored_policy_beside_a_random_one(trained, monkeypatch, which):
-    monkeypatch.setattr(training, "build", stub.build)
+    play_as(monkeypatch, stub.run())
     code, output = invoke(evaluate, trained, "--episodes", 3, "--video", "--checkpoint", which)
     assert code == 0
     assert "policy return" in output
@@ -187,7 +198,7 @@ def test_evaluate_plays_a_stored_policy_beside_a_random_one(trained, monkeypatch
     np.testing.assert_allclose(result["policy"]["mean"], np.mean(result["policy"]["returns"]))
     assert result["policy"]["returns"] != result["random"]["returns"]
     first = (trained / "evaluation.json").read_text()
-    monkeypatch.setattr(training, "build", lambda config: stub.build(config, image=False))
+    play_as(monkeypatch, stub.build(toy.config(), image=False))
     _, output = invoke(evaluate, trained, "--episodes", 3, "--video", "--checkpoint", which)
     assert "no video: this agent sees vectors" in output
     assert (trained / "evaluation.json").read_text() == first  # the same seed, the same episodes

@@ -33,7 +33,7 @@ def test_every_run_has_its_command_and_its_directory(tmp_path):
     got = set()
     for command in commands:
         assert command[:4] == [sys.executable, "-m", "ne_dreamer_jax", "train"]
-        options = train.main.make_context("train", command[3:]).params
+        options = train.main.make_context("train", command[4:]).params
         assert (options["size"], options["preset"], options["method"]) == ("1m", "dmc", "ne_dreamer/no_shift")
         assert options["assignments"] == ("loop.num_envs=4", "agent.batch_size=8")
         got.add((options["task"], options["seed"], options["logdir"]))
@@ -47,7 +47,7 @@ def test_every_run_has_its_command_and_its_directory(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "dmc/walker_wlak"], "no task is called 'dmc/walker_wlak'"),
+        (["--task", "dmc/walker_wlak"], "no environment is called 'dmc/walker_wlak'"),
         (["--task", "dmc/walker_walk", "--partition", "gpu"], "expected --partition together with --slurm"),
     ],
 )

@@ -82,7 +82,7 @@ def test_gradient_equals_finite_differences():
 
 @pytest.mark.parametrize("shapes", [((4, 5), (4, 6), (4, 5)), ((4, 1),) * 3, ((),) * 3])
 def test_wrong_shapes_are_refused(shapes):
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ValueError, match=r"of one shape|of shape .*H >= 1"):
         lambda_returns(*map(jnp.zeros, shapes))
 
 
