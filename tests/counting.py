@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax.agents.guard import SKIPPED
 from ne_dreamer_jax.envs.base import Core, Env, Pictures, Progress, from_core, restart_or_step
 from ne_dreamer_jax.types import (
     ArraySpec,
@@ -107,7 +108,7 @@ def stub(spec: EnvSpec, batch_size: int = 2, batch_length: int = 3, weight: floa
     def train_step(state: TrainState, batch: Any) -> Any:
         update = state.update + 1
         mark = jnp.full(batch.reward.shape, -update, jnp.float32)
-        metrics = {"update": update.astype(jnp.float32), "reward": jnp.mean(batch.reward)}
+        metrics = {"update": update.astype(jnp.float32), "reward": jnp.mean(batch.reward), SKIPPED: jnp.zeros(())}
         return state._replace(params=state.params + weight, update=update), latent(mark), metrics
 
     config = SimpleNamespace(batch_size=batch_size, batch_length=batch_length)

@@ -297,6 +297,7 @@ CHANGES = {
         "eval_every": "300",
         "eval_episodes": "3",
         "eval_max_steps": "5",
+        "max_skipped": "7",
         "write_latents": "false",
         "time_limits": "unmarked",
         "latent_dtype": "bfloat16",
@@ -387,7 +388,9 @@ def loop(config):
     """Sizes, the schedule and the compiled program."""
     env = counting.env()
     made = loops.make(config.loop, env, counting.stub(env.spec), 2)
-    yield str((made.budget, made.replay_bytes, config.loop.eval_episodes, config.loop.eval_max_steps))
+    yield str(
+        (made.budget, made.replay_bytes, config.loop.eval_episodes, config.loop.eval_max_steps, config.loop.max_skipped)
+    )
     yield str(Schedule.of(config, made))
     state = jax.eval_shape(made.init, KEY)
     yield program(made.chunk, state, jnp.zeros((), jnp.int32))

@@ -31,6 +31,8 @@ class LoopConfig:
     """Episodes of an evaluation, on environments of their own."""
     eval_max_steps: Count = 30_000
     """Agent steps after which an episode of an evaluation that has not ended is left; the result says so."""
+    max_skipped: Count = 50
+    """Updates in a row that may be skipped because their numbers are not finite; then the run stops."""
     write_latents: bool = True
     """Whether the posterior latents of an update replace those in replay."""
     time_limits: Literal["marked", "unmarked", "terminal"] = "marked"

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 
+from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.replay import ring
 from ne_dreamer_jax.replay.storage import Storage
@@ -29,13 +30,14 @@ def learn(
       key: consumed, for the batch.
 
     Returns:
-      The new train state, replay, and the update's metrics.
+      The new train state, replay, and the update's metrics as they are added up (`guard.counted`).
     """
     batch = draw_batch(agent, storage, replay, key)
+    update = train.update
     train, latents, metrics = agent.train_step(train, batch)
-    if write_latents:
-        replay = ring.write_latents(replay, batch.index, latents)
-    return train, replay, metrics
+    if write_latents:  # but not those of an update that was skipped
+        replay = ring.write_latents(replay, batch.index, latents, where=train.update > update)
+    return train, replay, guard.counted(metrics)
 
 
 def learn_what_is_due(

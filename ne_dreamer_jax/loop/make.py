@@ -128,7 +128,7 @@ def init_state(config: LoopConfig, env: VectorEnv, agent: Agent, key: Array) -> 
         policy=agent.init_policy(n),
         replay=(),
         episodes=Episodes(jnp.zeros((n,), jnp.float32), jnp.zeros((n,), jnp.int32)),
-        counters=Counters(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)),
+        counters=Counters(*(jnp.zeros((), jnp.int32) for _ in Counters._fields)),
         key=key,
     )
 
@@ -151,7 +151,8 @@ def chunk(
         train, replay, sums = learn_what_is_due(
             agent, storage, config.write_latents, due, state.train, state.replay, update_key, sums
         )
-        counters = Counters(done, credit - due * budget.update_cost)
+        in_a_row = jnp.where(train.update > state.train.update, 0, state.counters.skipped + due)
+        counters = Counters(done, credit - due * budget.update_cost, in_a_row)
         return state._replace(train=train, replay=replay, counters=counters, key=key), finished, sums
 
     state, finished, sums = jax.lax.fori_loop(

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.types import Array, Metrics, PolicyState
 
 
@@ -14,6 +15,7 @@ class Counters(NamedTuple):
 
     vector_step: Array  # agent steps of each environment
     credit: Array  # what updates are paid with, see `Budget`
+    skipped: Array  # updates skipped in a row, because their numbers were not finite
 
 
 class Episodes(NamedTuple):
@@ -68,5 +70,7 @@ class Report(NamedTuple):
             values["return"] = float(self.finished.returns / self.finished.episodes)
             values["length"] = float(self.finished.lengths / self.finished.episodes)
         if self.updates:
-            values |= {name: float(value) / int(self.updates) for name, value in self.learning.items()}
+            values |= {n: float(v) / int(self.updates) for n, v in self.learning.items() if not guard.is_count(n)}
+        # What was not finite is told where something was.
+        values |= {n: float(v) for n, v in self.learning.items() if guard.is_count(n) and v}
         return values

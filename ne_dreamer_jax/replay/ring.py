@@ -158,7 +158,7 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
 
 
 @in_32_bits
-def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
+def write_latents(replay: Replay, index: Array, latent: Latent, where: Array | bool = True) -> Replay:
     """The ring with newer latents at steps sampled from it.
 
     Args:
@@ -166,6 +166,7 @@ def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
       index: int32 ``[B, T]``, ``Batch.index``. Of a step that is there more than once (overlapping sequences) the last
         latent is kept, in row-major order, on every device.
       latent: ``[B, T, ...]``; ``stoch`` must be one-hot.
+      where: bool [], whether to write at all.
 
     Raises:
       ValueError: where shapes differ from the index's and the ring's.
@@ -182,7 +183,7 @@ def write_latents(replay: Replay, index: Array, latent: Latent) -> Replay:
         last = jnp.concatenate([ordered[1:] != ordered[:-1], jnp.ones(1, bool)])
         last = jnp.zeros_like(last).at[order].set(last)
         # Scatters with repeated indices have no order on a GPU: the others go to rows that do not exist, and are lost.
-        row = jnp.where(last, flat // envs, rows + jnp.arange(flat.size, dtype=jnp.int32))
+        row = jnp.where(last & where, flat // envs, rows + jnp.arange(flat.size, dtype=jnp.int32))
         env = flat % envs % ring.deter.shape[1]  # among those of this device
 
         def put(ring: Array, x: Array) -> Array:

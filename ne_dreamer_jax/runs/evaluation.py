@@ -126,20 +126,28 @@ def keys(seed: int) -> dict[str, Array]:
 def summary(evaluation: Evaluation) -> dict[str, Any]:
     """Returns and lengths as what `json.dumps` takes."""
     returns = np.asarray(evaluation.returns, np.float64)
+    mean, deviation = mean_and_deviation(returns)
     return {
-        "mean": float(returns.mean()),
-        "std": float(returns.std()),
+        "mean": mean,
+        "std": deviation,
         "returns": [float(value) for value in returns],
         "lengths": [int(value) for value in evaluation.lengths],
         "unfinished": evaluation.unfinished,
     }
 
 
+def mean_and_deviation(returns: np.ndarray) -> tuple[float, float]:
+    """Of returns [M], some of which may have overflown."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(returns.mean()), float(returns.std())
+
+
 def line(name: str, evaluation: Evaluation, where: str = "") -> str:
     """An evaluation in words."""
     returns = np.asarray(evaluation.returns, np.float64)
     open_end = f", {evaluation.unfinished} of them not ended" if evaluation.unfinished else ""
-    return f"{name:7} return {returns.mean():8.1f} ± {returns.std():.1f} over {len(returns)} episodes{open_end}{where}"
+    mean, deviation = mean_and_deviation(returns)
+    return f"{name:7} return {mean:8.1f} ± {deviation:.1f} over {len(returns)} episodes{open_end}{where}"
 
 
 def _video(

@@ -82,6 +82,10 @@ class Pace:
             parts.append(f"return {values['train/return']:.1f}")
         if "train/loss/total" in values:
             parts.append(f"loss {values['train/loss/total']:.4g}")
+        if values.get("train/skipped_updates"):
+            guilty = sorted(name.removeprefix("train/non_finite/") for name in values if "/non_finite/" in name)
+            shown = ", ".join(guilty[:3]) + (", ..." if len(guilty) > 3 else "")
+            parts.append(f"skipped updates: {values['train/skipped_updates']:.0f} (not finite: {shown})")
         if values.get("train/bad_actions"):
             parts.append(f"episodes cut by actions that are not finite: {values['train/bad_actions']:.0f}")
         if values.get("train/faults"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -46,7 +47,8 @@ class Record:
         None where there was none, where an episode was cut short, or where parameters are not finite.
         """
         sound = self.find("eval/cut_episodes", counters) == 0 and self.find("eval/finite", counters) == 1
-        return self.find("eval/return", counters) if sound else None
+        score = self.find("eval/return", counters) if sound else None
+        return score if score is not None and math.isfinite(score) else None
 
     @property
     def random_return(self) -> tuple[float, float] | None:

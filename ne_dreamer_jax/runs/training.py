@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax.agents import make_agent
+from ne_dreamer_jax.agents import guard, make_agent
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.config import Config
@@ -29,6 +29,7 @@ from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import OwnConfig
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
+from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record, Saves, whole
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
@@ -131,6 +132,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
             values = _named(report, before, counters, seconds)
             record.write(counters, values)
             echo(pace.line(before, counters, values, seconds))
+            if int(state.counters.skipped) >= run.config.loop.max_skipped:
+                return _diverged(run, files, report, state, echo)
             if saves.due():
                 saves.whole(state, counters, record.score(counters))
         saves.whole(state, counters, record.score(counters))
@@ -252,6 +255,25 @@ def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax
     return compiled
 
 
+DIVERGED = 3
+"""Exit code of a run that stopped because its updates were not finite."""
+
+
+def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, echo: Echo) -> int:
+    """Says what happened and what can be done; the state, which no such update has changed, is not saved."""
+    counted = {name.removeprefix(guard.PREFIX): value for name, value in report.learning.items()}
+    guilty = sorted(name for name, value in counted.items() if f"{guard.PREFIX}{name}" in report.learning and value)
+    found = checkpoint.checkpoints(files.checkpoints)
+    last = f"The last checkpoint is {found[0].path}." if found else "There is no checkpoint yet."
+    echo(
+        f"Stopped: {int(state.counters.skipped):,} updates in a row were not finite (loop.max_skipped is "
+        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. {last} Try a "
+        "lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the size of the rewards, or set "
+        "JAX_DEBUG_NANS=True to find the first operation."
+    )
+    return DIVERGED
+
+
 @jax.jit
 def _finite(params: Any) -> jax.Array:
     """Whether all parameters are finite numbers."""
@@ -269,8 +291,8 @@ def _named(report: Report, before: StepCounts, after: StepCounts, seconds: float
 
 
 def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
-    returns = np.asarray(evaluation.returns, np.float64)
-    return {f"{prefix}return": float(returns.mean()), f"{prefix}return_std": float(returns.std())}
+    mean, deviation = mean_and_deviation(np.asarray(evaluation.returns, np.float64))
+    return {f"{prefix}return": mean, f"{prefix}return_std": deviation}
 
 
 def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 from ne_dreamer_jax.envs import dmc
 from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.envs.dmc import support
-from ne_dreamer_jax.envs.dmc.simulation import integrated
+from ne_dreamer_jax.envs.dmc.simulation import start_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -246,7 +246,7 @@ def run_like_mujoco(model, steps, seed, dtype):
     qvel = 0.3 * rng.normal(size=model.nv)
     simulation = dmc.Simulation.of(model)
     initial = simulation.initial()
-    start = integrated(initial.replace(qvel=jnp.asarray(qvel, dtype)))
+    start = start_of(initial.replace(qvel=jnp.asarray(qvel, dtype)))
     advance = jax.jit(simulation.advance)
     data = advance(initial, jnp.zeros(model.nu, dtype), jnp.ones((), bool), start)
     reference = mujoco.MjData(model)

@@ -30,7 +30,7 @@ def build(config, *, image: bool = True) -> training.Run:
 
     def init(key: Array) -> LoopState:
         start_key, key = jax.random.split(key)
-        zeros = [jnp.zeros((), jnp.int32) for _ in range(3)]  # apart, since the state is donated
+        zeros = [jnp.zeros((), jnp.int32) for _ in range(4)]  # apart, since the state is donated
         params = {"actor": {"kernel": jax.random.normal(start_key, (3,))}}
         scale = ReturnScale(jnp.zeros(()), jnp.zeros(()))
         train = TrainState(params, {}, {}, (), scale, jnp.copy(start_key), zeros[0])
@@ -50,7 +50,9 @@ def build(config, *, image: bool = True) -> training.Run:
             back = frames.get("image", jnp.minimum(jnp.arange(total)[:, None], done) * n + (tickets % n)[None])
             drawn = jnp.sum(back, axis=(0, 2, 3, 4), dtype=jnp.uint8)
         replay = state.replay.at[done].set(drawn)
-        return state._replace(train=train, replay=replay, counters=Counters(done + 1, done), key=key)
+        return state._replace(
+            train=train, replay=replay, counters=Counters(done + 1, done, state.counters.skipped), key=key
+        )
 
     @functools.partial(jax.jit, donate_argnums=0)
     def chunk(state: LoopState, steps: Array):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from ne_dreamer_jax import shapes
-from ne_dreamer_jax.agents import optim
+from ne_dreamer_jax.agents import guard, optim
 from ne_dreamer_jax.agents.base import Agent, Heads, Imagined, Inspection
 from ne_dreamer_jax.agents.dreamer import behavior, world_model
 from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
@@ -176,7 +176,9 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
             update=update,
         )
         metrics["gradient_norm"] = optax.tree.norm(grads)
-        return new, jax.lax.stop_gradient(latent), metrics
+        named = {name: metrics[f"loss/{name}"] for name in config.loss_scales}
+        finite, what_is_not = guard.check(named, grads)
+        return guard.keep_unless(finite, new, state), jax.lax.stop_gradient(latent), metrics | what_is_not
 
     return Agent(
         init=jax.jit(in_32_bits(init)),

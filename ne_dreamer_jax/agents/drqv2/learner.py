@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from ne_dreamer_jax import shapes
+from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.drqv2.config import DrQv2Config
 from ne_dreamer_jax.agents.drqv2.networks import Networks
 from ne_dreamer_jax.agents.drqv2.transitions import Transitions, n_step, random_shift
@@ -122,10 +123,10 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
         data = n_step(batch, config.frame_stack, config.discount)
 
         of_critic = _of_critic(state.params)
-        (error, (encoding, target)), grads = jax.value_and_grad(critic_losses, has_aux=True)(
+        (error, (encoding, target)), critic_grads = jax.value_and_grad(critic_losses, has_aux=True)(
             of_critic, state, keys[:3], data, std
         )
-        of_critic, critic_optimizer = descend(of_critic, grads, state.optimizer["critic"])
+        of_critic, critic_optimizer = descend(of_critic, critic_grads, state.optimizer["critic"])
         # The critic as it is now, but the encodings that the batch had before the update.
         loss, grads = jax.value_and_grad(actor_loss)(
             state.params["actor"],
@@ -146,7 +147,9 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
             update=state.update + 1,
         )
         metrics = {"loss/critic": error, "loss/actor": loss, "loss/total": error + loss, "target": target, "noise": std}
-        return new, nothing(batch.reward.shape[0], length), metrics
+        finite, what_is_not = guard.check({"critic": error, "actor": loss}, {**critic_grads, "actor": grads})
+        new = guard.keep_unless(finite, new, state)
+        return new, nothing(batch.reward.shape[0], length), metrics | what_is_not
 
     def descend(params: Params, grads: Params, optimizer: Any) -> tuple[Params, Any]:
         with jax.numpy_dtype_promotion("standard"):  # optax raises floats to int32 powers
