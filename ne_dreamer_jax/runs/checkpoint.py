@@ -16,6 +16,7 @@ short is never seen. One that was damaged later is passed over for the one befor
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -28,6 +29,7 @@ import jax
 import numpy as np
 
 from ne_dreamer_jax.files import sync_file, write_text
+from ne_dreamer_jax.system import memory
 
 MANIFEST = "manifest.json"
 FORMAT = 2
@@ -46,6 +48,10 @@ class Checkpoint(NamedTuple):
     score: float | None  # the evaluation return at this step, where there was an evaluation
     items: dict[str, dict[str, dict[str, Any]]]  # item -> name of an array -> shape, dtype, sha256
     files: dict[str, dict[str, str]]  # item -> path of a file in the item's folder -> sha256
+
+
+class SaveError(Exception):
+    """A checkpoint could not be written; the message names the path and the cause."""
 
 
 class Restored(NamedTuple):
@@ -74,7 +80,49 @@ def save(
 
     Raises:
       TypeError: a leaf that is no array.
+      SaveError: the disk is full, read-only, gone or the like; what was saved before stands as it was.
     """
+    _check_space(directory, items)
+    try:
+        return _save(directory, step, items, score)
+    except OSError as error:
+        cause = error.strerror or str(error)
+        raise SaveError(f"could not save a checkpoint in {error.filename or directory}: {cause}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            _remove_partial(directory)
+
+
+def nbytes(items: Mapping[str, Any]) -> int:
+    """About what the arrays of these items take on disk."""
+    return sum(_nbytes(leaf) for leaf in jax.tree.leaves(dict(items)) if hasattr(leaf, "dtype"))
+
+
+def _nbytes(leaf: Any) -> int:
+    if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended):
+        return 16 * math.prod(leaf.shape)  # keys
+    return math.prod(leaf.shape) * leaf.dtype.itemsize
+
+
+def free_space(directory: Path) -> int:
+    """Bytes that are free where a directory is, or will be."""
+    existing = next(path for path in [directory, *directory.absolute().parents] if path.exists())
+    return shutil.disk_usage(existing).free
+
+
+def _check_space(directory: Path, items: Mapping[str, Any]) -> None:
+    try:
+        needed, free = nbytes(items), free_space(directory)
+    except OSError as error:
+        raise SaveError(f"could not save a checkpoint in {directory}: {error.strerror or error}") from error
+    if needed > free:
+        raise SaveError(
+            f"could not save a checkpoint in {directory}: it takes up to {memory.readable(needed)}, and "
+            f"{memory.readable(free)} are free; make room there"
+        )
+
+
+def _save(directory: Path, step: int, items: Mapping[str, Any], score: float | None) -> Checkpoint:
     directory.mkdir(parents=True, exist_ok=True)
     _remove_partial(directory)
     partial = directory / f"{_PARTIAL}{step:012d}"

@@ -12,6 +12,7 @@ in the middle heals. Standard library and numpy only.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -56,8 +57,9 @@ class Writer:
         self._file.flush()
 
     def close(self) -> None:
-        """Closes the file."""
-        self._file.close()
+        """Closes the file; what a full disk has not taken by now is lost."""
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def __enter__(self) -> Writer:
         return self

@@ -25,13 +25,22 @@ def whole(frames: HostFrames | None) -> tuple[str, ...]:
 class Record:
     """The metrics of a run so far, on disk and at hand."""
 
-    def __init__(self, writer: metrics.Writer, lines: list[dict[str, Any]]) -> None:
-        self._writer = writer
+    def __init__(
+        self, writer: metrics.Writer, lines: list[dict[str, Any]], echo: Callable[[str], None] = lambda line: None
+    ) -> None:
+        self._writer, self._echo = writer, echo
+        self._failing = False
         self.lines = lines
 
     def write(self, counters: StepCounts, values: Mapping[str, Any]) -> None:
         """Adds a line."""
-        self._writer.write(counters, values)
+        try:
+            self._writer.write(counters, values)
+            self._failing = False
+        except OSError as error:  # the line stays in the file's buffer, and goes with the next
+            if not self._failing:
+                self._echo(f"Could not write metrics: {error.strerror or error}. Training goes on; the lines are kept.")
+            self._failing = True
         self.lines.append(counters._asdict() | {name: float(value) for name, value in values.items()})
 
     def find(self, name: str, counters: StepCounts | None = None) -> float | None:
@@ -66,6 +75,8 @@ class Saves:
         self._directory, self._seconds, self._echo = files.checkpoints, seconds, echo
         self._frames, self._items = frames, whole(frames)
         self._last = time.monotonic()
+        self.failed = False
+        """Whether the last attempt to save failed."""
 
     def due(self) -> bool:
         """Whether the interval is over."""
@@ -101,6 +112,14 @@ class Saves:
             items = parallel.gather(items)
             if jax.process_index() > 0:
                 return
-        checkpoint.save(self._directory, counters.env_step, items, score=score)
-        checkpoint.prune(self._directory, whole=self._items)
+        try:
+            checkpoint.save(self._directory, counters.env_step, items, score=score)
+            checkpoint.prune(self._directory, whole=self._items)
+        except (checkpoint.SaveError, OSError) as error:
+            self.failed = True
+            kept = checkpoint.checkpoints(self._directory)
+            last = f"the last one is {kept[0].path}" if kept else "there is none yet"
+            self._echo(f"Not saved: {error}. Training goes on, and the next attempt is at the next interval; {last}.")
+            return
+        self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

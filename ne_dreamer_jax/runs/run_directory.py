@@ -158,7 +158,10 @@ def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
         if not files.config.exists():
             marker.write(_MARKER_TEXT)
             marker.flush()
-            store_config(files, config)
+            try:
+                store_config(files, config)
+            except OSError as error:
+                raise RefusedError(f"{files.config} can't be written: {error.strerror or error}") from error
         yield files
 
 

@@ -35,7 +35,7 @@ from ne_dreamer_jax.runs.record import Record, Saves, whole
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.runs.signals import Stop
-from ne_dreamer_jax.system import compile_cache, parallel
+from ne_dreamer_jax.system import compile_cache, memory, parallel
 from ne_dreamer_jax.types import images_of
 
 Echo = Callable[[str], None]
@@ -87,7 +87,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       echo: takes the lines for people.
 
     Returns:
-      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one.
+      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, `DIVERGED` where
+      updates were not finite, `NOT_SAVED` where the last checkpoint could not be written.
 
     Raises:
       ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
@@ -97,6 +98,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
     state, lines = _start(run, files, start_key, echo)
+    echo(_space(run, files))
     counters = schedule.counters(state)
     pace = progress.Pace(schedule)
     saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
@@ -104,7 +106,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     frames = None
     is_main_process = parallel.is_main_process()
     with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
-        record = Record(writer, lines)
+        record = Record(writer, lines, echo)
         while True:
             step = counters.agent_step // schedule.num_envs
             missing, with_random = parallel.agreed(
@@ -139,10 +141,11 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         saves.whole(state, counters, record.score(counters))
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
-            return 128 + stopped_by
+            return NOT_SAVED if saves.failed else 128 + stopped_by
     if not is_main_process:
         return 0
-    checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
+    if not saves.failed:
+        checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
     if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
@@ -152,6 +155,9 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     draw(run, files, record, echo)
     for line in _conclusion(run, files, record):
         echo(line)
+    if saves.failed:
+        echo(f"The end of this run is not saved. Make room in {files.path}, and give the same command again.")
+        return NOT_SAVED
     return 0
 
 
@@ -232,6 +238,18 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if is_main_process else []
 
 
+def _space(run: Run, files: RunDirectory) -> str:
+    """What checkpoints take, and whether there is room for them."""
+    items = [run.shapes, *([] if run.loop.frames is None else [run.loop.frames.shapes])]
+    each = sum(checkpoint.nbytes({"item": item}) for item in items)
+    free = checkpoint.free_space(files.path)
+    # Two whole ones stand at a time, and one is being written.
+    enough = "" if 3 * each <= free else " WARNING: that is too little for three, which there are at times"
+    return (
+        f"A checkpoint takes up to {memory.readable(each)}; {memory.readable(free)} are free in {files.path}.{enough}"
+    )
+
+
 def _same_for_all(files: RunDirectory, env_step: int) -> None:
     if parallel.agreed(env_step) != (env_step,):
         raise ValueError(
@@ -257,6 +275,8 @@ def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax
 
 DIVERGED = 3
 """Exit code of a run that stopped because its updates were not finite."""
+NOT_SAVED = 4
+"""Exit code of a run whose last checkpoint could not be written."""
 
 
 def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, echo: Echo) -> int:
