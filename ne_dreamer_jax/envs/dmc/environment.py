@@ -124,7 +124,7 @@ def _check_parts(task: Task, initial: mjx.Data) -> None:
                 f"task.reset: expected a pair of an mjx.Data and what the episode draws, got {_kind(result)}; where it "
                 "draws nothing else, return data, ()"
             )
-        drawn.extend(name for name in _CONSEQUENCES if getattr(result[0], name) is not getattr(initial, name))
+        drawn.extend(name for name in _CONSEQUENCES if _differs(getattr(initial, name), getattr(result[0], name)))
         return result
 
     data, episode = jax.eval_shape(begin, key)
@@ -148,6 +148,11 @@ def _check_parts(task: Task, initial: mjx.Data) -> None:
     posed = jax.eval_shape(task.pose, initial, _arrays(task.episode))
     if not isinstance(posed, mjx.Data):
         raise ValueError(f"task.pose: expected an mjx.Data, got {_kind(posed)}")
+
+
+def _differs(old: Array, new: Any) -> bool:
+    """Whether a field may be another than the default state's, which is a constant also while a reset is traced."""
+    return isinstance(new, jax.core.Tracer) or not np.array_equal(old, new, equal_nan=True)
 
 
 def _check_consequences(task: Task, initial: mjx.Data, key: Array) -> None:
