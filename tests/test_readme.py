@@ -3,8 +3,15 @@
 import re
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import ne_dreamer_jax as nedreamer
 from experiments import train
+from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.settings import names
+from tests.experiments import toy
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -27,3 +34,41 @@ def test_every_path_in_the_readme_exists():
     for row in re.findall(r"^\| (`.*?`) \|", README.split("## Where things are")[1], re.MULTILINE):
         for path in re.findall(r"`([^`]+)`", row):
             assert (ROOT / path).exists() or (ROOT / "ne_dreamer_jax" / path).exists(), path
+
+
+def blocks(heading):
+    """The Python code under a heading of the README."""
+    text = README.split(f"\n{heading}\n")[1].split("\n#")[0]
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
+    """Its code runs as it stands, trained with a tiny agent in place of a preset's."""
+    monkeypatch.chdir(tmp_path)
+    tiny = toy.config()
+    monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
+    (code,) = blocks("### Your own environment")
+    made = {}
+    exec(compile(code, "README.md", "exec"), made)
+    assert (tmp_path / "runs" / "corridor" / "evaluation.json").exists()
+    env = made["corridor"]()
+    state, _ = env.reset(jax.random.key(0))
+    for _ in range(6):  # to the right, as far as any corridor goes
+        state, timestep = env.step(state, jnp.ones((), jnp.int32))
+        if timestep.is_last:
+            break
+    assert timestep.is_terminal
+    assert float(timestep.reward) == 1.0
+
+
+def test_the_readmes_episodes_are_learned_from():
+    (code,) = blocks("### Your own episodes")
+    config = toy.config()
+    env = toy.env()
+    agent = make_agent(config.agent, env.spec)
+    obs, actions, rewards = np.zeros((8, 1)), np.zeros((7, 1)), np.zeros(7)
+    given = {"config": config, "env": env, "agent": agent, "state": agent.init(jax.random.key(0)), "jax": jax}
+    given |= {"obs": obs, "actions": actions, "rewards": rewards, "nedreamer": nedreamer}
+    code = code.replace('{"vector": obs}', '{"position": obs}').replace("[episode, ...]", "[episode]")
+    exec(compile(code.replace("1_000", "2"), "README.md", "exec"), given)
+    assert int(given["state"].update) == 2

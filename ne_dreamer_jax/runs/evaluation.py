@@ -162,7 +162,10 @@ def _video(
 
 
 def own(config: Config, env: Any) -> Config:
-    """The configuration of a run on an environment that is given as an object: it says so."""
+    """The configuration of a run on an environment that is given as an object: it says so.
+
+    Each of its steps counts for one environment step, unless the configuration is of such a run already.
+    """
     if env is None or isinstance(config.env, OwnConfig):
         return config
-    return replace(config, env=OwnConfig(action_repeat=config.env.action_repeat))
+    return replace(config, env=OwnConfig())
