@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,16 @@ from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, TimeStep, Transition
 
 
+class Evaluate(Protocol):
+    """Plays episodes of its own, with the policy's mode or with random actions."""
+
+    def __call__(
+        self, params: Any, key: Array, episodes: int | None = None, random: bool = False, frames: bool = False
+    ) -> Evaluation:
+        """(params, key) -> ``episodes`` of them, or as many as configured; ``frames`` keeps the first one's images."""
+        ...
+
+
 class Loop(NamedTuple):
     """The functions of a training run."""
 
@@ -42,9 +52,7 @@ class Loop(NamedTuple):
     """key -> the state before the first step."""
     chunk: Callable[[LoopState, Array], tuple[LoopState, Report]]
     """(state, vector steps int32 []) -> new state and what happened. Jitted; donates the state."""
-    evaluate: Callable[..., Evaluation]
-    """(params, key, episodes=None, random=False, frames=False) -> episodes of the policy's mode, or of random actions.
-    """
+    evaluate: Evaluate
     state_shapes: Callable[[], LoopState]
     """() -> shapes and dtypes of the state and, on a mesh, where each array lies."""
     budget: Budget

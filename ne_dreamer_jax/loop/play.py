@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -52,16 +51,25 @@ class Playing(NamedTuple):
     done: Array  # bool [M]
 
 
-Play = Callable[..., Evaluation]
-"""(params, key, episodes, random=False, frames=False, steps=False) -> `Evaluation`."""
+class Play(Protocol):
+    """Plays episodes with an agent's mode, or with uniformly random actions."""
+
+    def __call__(
+        self, params: Any, key: Array, episodes: int, random: bool = False, frames: bool = False, steps: bool = False
+    ) -> Evaluation:
+        """(params, key, M) -> the first episode of each of M environments side by side.
+
+        ``frames`` keeps the first environment's images, ``steps`` what was seen and done in all.
+        """
+        ...
 
 
 def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = STEPS) -> Play:
-    """A function that plays episodes with an agent's mode, or with uniformly random actions.
+    """A function that plays episodes in these environments with this agent.
 
-    ``play(params, key, episodes, random=False, frames=False, steps=False)``: ``episodes`` environments run side by side
-    until each has ended its first episode, or after ``max_steps`` agent steps; ``frames`` keeps the first one's images,
-    ``steps`` what was seen and done in all.
+    Args:
+      max_steps: agent steps after which an episode that has not ended is left; `Evaluation.unfinished` counts those.
+      chunk_steps: vector steps of one call to the device.
     """
     run = jax.jit(
         in_32_bits(partial(_run, env, agent, chunk_steps)), static_argnames=("frames", "steps"), donate_argnums=1
