@@ -118,10 +118,11 @@ def released_code(size: str) -> Config:
         base,
         heads=replace(base.heads, clip_actions=False),
         world_model=WorldModelConfig(kl_unimix=0.0),
+        behavior=BehaviorConfig(discount_in_head=False),
         objective=NextEmbedding(action="previous", masked=False, across_episodes=True),
         optimizer=OptimizerConfig(name="laprop"),
     )
-    return Config(agent=agent, loop=LoopConfig(capacity=500_000, write_latents=False, time_limits="unmarked"))
+    return Config(agent=agent, loop=LoopConfig(capacity=500_000, write_latents=False, prefill=1_056))
 
 
 PRESETS = {

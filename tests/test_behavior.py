@@ -253,6 +253,26 @@ def test_returns_are_normalised_by_no_less_than_the_floor():
     assert metrics["imagined/return_scale"] == jnp.float32(1e12)
 
 
+def test_the_discount_is_in_the_head_or_multiplied_outside():
+    """Both say gamma times the probability of going on, once each head has learned what it is trained towards."""
+    inside, outside = CONFIG, replace(CONFIG, discount_in_head=False)
+    assert (behavior.head_discount(inside), behavior.head_discount(outside)) == (0.9, 1.0)
+    for probability in (0.0, 0.3, 0.999):
+        learned = jnp.array([[0.9 * probability], [probability]], jnp.float32)
+        logits = jnp.log(learned) - jnp.log1p(-learned)
+        for config, logit in zip((inside, outside), logits, strict=True):
+            np.testing.assert_allclose(behavior.expected_discount(config, logit), 0.9 * probability, rtol=1e-5)
+
+
+def test_imagined_returns_are_smaller_where_the_same_head_leaves_the_discount_outside():
+    rewards = {}
+    for flag in (True, False):
+        model = make(tiny.VECTORS, replace(CONFIG, discount_in_head=flag))
+        out = jax.jit(lambda model=model: model.compute(model.params, model.slow, model.batch, KEY)[1])()
+        rewards[flag] = out[0][0]["critic"]
+    assert not np.allclose(rewards[True], rewards[False])
+
+
 def test_percentiles_are_in_order():
     with pytest.raises(ValueError, match=r"return_percentiles: expected the first below the second, got 95.0 and 5.0"):
         BehaviorConfig(return_percentiles=(95.0, 5.0))

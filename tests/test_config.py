@@ -185,7 +185,8 @@ def test_the_released_code_differs_where_fidelity_says_so():
         "agent.optimizer.name": "laprop",
         "loop.capacity": 500_000,
         "loop.write_latents": False,
-        "loop.time_limits": "unmarked",
+        "loop.prefill": 1_056,
+        "agent.behavior.discount_in_head": False,
     }
     fidelity = (Path(__file__).parents[1] / "experiments" / "FIDELITY.md").read_text()
     for path in code:
@@ -261,6 +262,7 @@ CHANGES = {
     "agent.behavior": {
         "horizon": "2",
         "discount": "0.85",
+        "discount_in_head": "false",
         "lam": "0.9",
         "entropy": "0.1",
         "gradient": "dynamics",

@@ -144,7 +144,7 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         observe_key, objective_key, imagine_key = jax.random.split(key, 3)
         rollout, posterior = world_model.posterior_rollout(nets, params, observe_key, batch)
         model, model_metrics = world_model.prediction_losses(
-            nets, config.world_model, params, rollout, posterior, config.behavior.discount
+            nets, config.world_model, params, rollout, posterior, behavior.head_discount(config.behavior)
         )
         representation, objective_metrics = objective.loss(params, state.target, objective_key, rollout)
         actor_critic, scale, behavior_metrics = behavior.actor_critic_losses(
@@ -203,7 +203,7 @@ def inspection(config: AgentConfig, nets: Networks) -> Inspection:
         distribution = policy(config.heads, nets.spec.action, nets.apply("actor", params, feature))
         return Heads(
             reward=twohot_mean(nets.apply("reward", params, feature), bins),
-            discount=jax.nn.sigmoid(nets.apply("continue", params, feature)[..., 0]),
+            discount=behavior.expected_discount(config.behavior, nets.apply("continue", params, feature)),
             value=twohot_mean(nets.apply("critic", params, feature), bins),
             action=decode_action(nets.spec.action, distribution.mode(), config.heads.clip_actions),
         )

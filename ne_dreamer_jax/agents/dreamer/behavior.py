@@ -44,6 +44,9 @@ class BehaviorConfig:
     """H, imagined steps."""
     discount: ShareBelowOne = 0.997
     """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
+    discount_in_head: bool = True
+    """Whether the continuation head is trained towards discount * (1 - terminal), as DreamerV3, or towards 1 - terminal
+    with the discount multiplied outside, as in the paper's equations and the released code."""
     lam: Share = 0.95
     """lambda of the returns."""
     entropy: NonNegative = 3e-4
@@ -110,6 +113,20 @@ def imagine(
     return Trajectory(seen, look(feature(last)), outputs, actions)
 
 
+def expected_discount(config: BehaviorConfig, logits: Array) -> Array:
+    """What the continuation head's output [..., 1] says that the value of a state counts for, [...].
+
+    The head's probability contains the discount already, or it is multiplied here (`BehaviorConfig.discount_in_head`).
+    """
+    going_on = jax.nn.sigmoid(logits[..., 0])
+    return going_on if config.discount_in_head else config.discount * going_on
+
+
+def head_discount(config: BehaviorConfig) -> float:
+    """What the continuation head is trained towards where the episode goes on."""
+    return config.discount if config.discount_in_head else 1.0
+
+
 def keep_products(apply: Callable[..., Any]) -> Callable[..., Any]:
     """`Networks.apply` for a scan, of which matrix products alone are kept for the gradient.
 
@@ -161,8 +178,7 @@ def actor_critic_losses(
         seen = state if through_model else fixed
         return Judgement(
             reward=twohot_mean(apply("reward", frozen, seen), bins),
-            # The head's probability already contains the discount (see world_model.prediction_losses).
-            discount=jax.nn.sigmoid(apply("continue", frozen, seen)[..., 0]),
+            discount=expected_discount(config, apply("continue", frozen, seen)),
             value=twohot_mean(apply("critic", frozen, seen) if through_model else jax.lax.stop_gradient(logits), bins),
             logits=logits,
             slow_value=slow_value(fixed),

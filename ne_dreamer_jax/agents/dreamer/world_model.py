@@ -70,7 +70,8 @@ def prediction_losses(
 ) -> tuple[dict[str, Array], Metrics]:
     """KL (eq. for L_kl, balanced), reward and continuation losses, each averaged over B and T.
 
-    The continuation's target is ``discount * (1 - is_terminal)``: the head's probability contains the discount.
+    The continuation's target is ``discount * (1 - is_terminal)``: the head's probability contains the discount, unless
+    it is given as 1.
     """
     prior: Any = nets.rssm.apply({"params": params["rssm"]}, rollout.latent.deter, method=RSSM.prior)
     dynamics, representation = balanced_kl(posterior, prior, config.free_nats, config.kl_unimix)
