@@ -202,9 +202,12 @@ def our_resets(task: Task, num_resets: int, seed: int = 0) -> np.ndarray:
     core = environment.make_core(task, "vector", action_repeat=2, image_size=64)
 
     def draw(key: jax.Array) -> jax.Array:
-        state = core.reset(key)
-        drawn = map(jnp.ravel, jax.tree.leaves(state.episode))
-        return jnp.concatenate([state.physics.qpos, state.physics.qvel, *drawn])
+        if task.coast:
+            state = core.reset(key)
+            data, episode = state.physics, state.episode
+        else:  # an episode begins in the state that is drawn, which compiles no physics
+            data, episode = task.reset(key)
+        return jnp.concatenate([data.qpos, data.qvel, *map(jnp.ravel, jax.tree.leaves(episode))])
 
     return np.asarray(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(seed), num_resets)))
 
