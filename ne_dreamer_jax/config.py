@@ -18,7 +18,7 @@ from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
 from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.envs import config as env_configs
-from ne_dreamer_jax.envs.config import DmcConfig, EnvConfig
+from ne_dreamer_jax.envs.config import DmcConfig, EnvConfig, RoomsConfig
 from ne_dreamer_jax.loop import budget
 from ne_dreamer_jax.loop.config import LoopConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
@@ -80,6 +80,12 @@ def dmc(size: str) -> Config:
     return Config(agent=agent_config(size))
 
 
+def rooms(size: str) -> Config:
+    """The paper's DMLab Rooms setting: 50M frames, action repeat 4, 32 replayed steps a policy step."""
+    loop = LoopConfig(env_steps=50_000_000, replay_ratio=32.0, eval_every=1_000_000)
+    return Config(RoomsConfig(), agent_config(size), loop)
+
+
 def quickstart(size: str) -> Config:
     """Learns in minutes on two CPU cores.
 
@@ -127,6 +133,7 @@ def released_code(size: str) -> Config:
 
 PRESETS = {
     "dmc": (dmc, "12m"),
+    "rooms": (rooms, "12m"),
     "released_code": (released_code, "12m"),
     "quickstart": (quickstart, "1m"),
     "smoke": (smoke, "1m"),

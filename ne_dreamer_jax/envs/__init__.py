@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ne_dreamer_jax.envs.base import Env
 
 __getattr__, __dir__, _ = lazy_loader.attach(
-    __name__, submodules=["base", "config", "conformance", "dmc", "probes", "registry", "vector"]
+    __name__, submodules=["base", "config", "conformance", "dmc", "probes", "registry", "rooms", "vector"]
 )
 __all__ = ["check", "make", "names", "register"]
 
@@ -25,7 +25,8 @@ def make(name: str, **options: Any) -> Env:
     """Makes the environment called ``name``, e.g. ``"dmc/walker_walk"``, ``"mypackage.envs:make"``.
 
     Options of DMC tasks (see ``envs.dmc.make``): ``obs="pixels" | "vector" | "both"``, ``action_repeat=2``,
-    ``image_size=64``, ``fast=False``. Environments of people's own take none.
+    ``image_size=64``, ``fast=False``; of Rooms tasks (``envs.rooms.make``): ``image_size=64``, ``length=None``.
+    Environments of people's own take none.
 
     Raises:
       ValueError: no environment has that name (the message names close matches), or an option has a bad value.

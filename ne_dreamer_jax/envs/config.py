@@ -35,6 +35,25 @@ class DmcConfig:
 
 
 @dataclass(frozen=True)
+class RoomsConfig:
+    """A Rooms task; each of its actions is held for four frames."""
+
+    task: str = "rooms/watermaze"
+    image_size: Annotated[int, Range(8, 4_096)] = 64
+    """Height and width of the frames."""
+    length: Annotated[int, Range(1, 1_000_000)] | Literal["native"] | None = None
+    """Agent steps of an episode; native: DMLab's own; none: the paper's, at most 900."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps (frames) of an agent step."""
+        return 4
+
+
+@dataclass(frozen=True)
 class OwnConfig:
     """An environment of one's own, which says itself how it is observed."""
 
@@ -47,10 +66,10 @@ class OwnConfig:
         ranges.check(self)
 
 
-EnvConfig = DmcConfig | OwnConfig
+EnvConfig = DmcConfig | RoomsConfig | OwnConfig
 """The settings that a configuration may choose from: which, the task's name decides."""
 
-_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, None: OwnConfig}
+_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, "rooms/": RoomsConfig, None: OwnConfig}
 
 
 def for_task(task: str, like: Any) -> Any:

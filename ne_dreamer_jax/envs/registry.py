@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ne_dreamer_jax.envs.dmc.names import NAMES as DMC_NAMES
+from ne_dreamer_jax.envs.rooms.names import NAMES as ROOMS_NAMES
 from ne_dreamer_jax.settings.text import did_you_mean
 
 
@@ -23,7 +24,10 @@ class Family(NamedTuple):
     """Those that can be made."""
 
 
-FAMILIES: dict[str, Family] = {"dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES)}
+FAMILIES: dict[str, Family] = {
+    "dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES),
+    "rooms/": Family("ne_dreamer_jax.envs.rooms.tasks", lambda: ROOMS_NAMES),
+}
 """Prefix -> family."""
 
 _registered: dict[str, Callable[[], Any]] = {}

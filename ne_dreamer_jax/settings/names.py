@@ -14,6 +14,6 @@ METHODS = (
     "dreamer_no_reconstruction",
     "drqv2",
 )
-PRESETS = ("dmc", "released_code", "quickstart", "smoke")
+PRESETS = ("dmc", "rooms", "released_code", "quickstart", "smoke")
 SIZES = ("1m", "12m", "25m", "50m", "100m", "200m", "400m")
 OBSERVATIONS = ("pixels", "vector", "both")
