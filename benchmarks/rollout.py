@@ -24,7 +24,9 @@ from ne_dreamer_jax.system.quiet import quiet
     show_default=True,
     help="Environments stepped together. May be repeated.",
 )
-@click.option("--obs", type=click.Choice(["pixels", "vector", "both"]), default="vector", show_default=True)
+@click.option(
+    "--obs", type=click.Choice(["pixels", "vector", "both"]), default="vector", show_default=True, help="Of dmc tasks."
+)
 @click.option("--action-repeat", type=click.IntRange(1), default=2, show_default=True)
 @click.option("--steps", type=click.IntRange(1), default=20, show_default=True, help="Agent steps in a timed call.")
 @click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
@@ -75,12 +77,15 @@ def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int,
 
     from ne_dreamer_jax.envs import conformance
 
-    env = envs.make(task, obs=obs, action_repeat=action_repeat, **options)
+    if task.startswith("dmc/"):
+        options = {"obs": obs, "action_repeat": action_repeat, **options}
+    env = envs.make(task, **options)
 
     def run(state: Any, key: jax.Array) -> tuple[Any, Any]:
         def step(state: Any, key: jax.Array) -> tuple[Any, Any]:
             state, timestep = jax.vmap(env.step)(state, conformance.random_action(env, key, num_envs))
-            return state, (timestep.reward, {name: value.sum() for name, value in timestep.obs.items()})
+            seen = {name: value.astype("float32").sum() for name, value in timestep.obs.items()}
+            return state, (timestep.reward, seen)
 
         return jax.lax.scan(step, state, jax.random.split(key, steps))
 

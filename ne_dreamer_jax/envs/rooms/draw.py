@@ -47,12 +47,11 @@ class Items(NamedTuple):
 
 
 class Posters(NamedTuple):
-    """Pictures on walls, M of them, each a symbol on a coloured square."""
+    """Pictures on walls, one for each of `SYMBOLS`, on a coloured square."""
 
-    position: Array  # float32 [M, 2], centres
-    across: Array  # float32 [M, 2], unit vectors along the wall, to the right of who looks at them
-    colour: Array  # float32 [M, 3]
-    symbol: Array  # int32 [M], an index of `SYMBOLS`
+    position: Array  # float32 [8, 2], centres
+    across: Array  # float32 [8, 2], unit vectors along the wall, to the right of who looks at them
+    colour: Array  # float32 [8, 3]
 
 
 class Scene(NamedTuple):
@@ -255,20 +254,18 @@ def _posters(
     point = position[None, None] + depth[..., None] * rays[None]
     z = scene.eye + up[:, None] * depth
 
-    def hang(picture: Array, poster: tuple[Array, Array, Array, Array]) -> tuple[Array, None]:
-        centre, across, colour, symbol = poster
-        offset = point - centre
+    sharp = POSTER_SIZE[0] / 2 / jnp.maximum(pixel * depth, 1e-3)
+    for number, shape in enumerate(SYMBOLS):  # each poster has a symbol of its own
+        across, offset = posters.across[number], point - posters.position[number]
         a = (offset @ across) / (POSTER_SIZE[0] / 2)
         b = (z - POSTER_HEIGHT) / (POSTER_SIZE[1] / 2)
         off_wall = jnp.abs(offset[..., 0] * across[1] - offset[..., 1] * across[0])
-        sharp = POSTER_SIZE[0] / 2 / jnp.maximum(pixel * depth, 1e-3)
-        inside = jnp.where(off_wall < 8.0, jnp.clip(0.5 - (jnp.maximum(jnp.abs(a), jnp.abs(b)) - 1) * sharp, 0, 1), 0.0)
-        distances = jnp.stack([shape(a / 0.6, b / 0.6) * 0.6 for shape in SYMBOLS])
-        on = jnp.clip(0.5 - distances[symbol] * sharp, 0, 1)
-        face = colour * (1 - on)[..., None] + jnp.array([215.0, 245.0, 240.0]) * on[..., None]
-        return picture + inside[..., None] * (face - picture), None
-
-    return jax.lax.scan(hang, picture, (posters.position, posters.across, posters.colour, posters.symbol))[0]
+        inside = jnp.clip(0.5 - (jnp.maximum(jnp.abs(a), jnp.abs(b)) - 1) * sharp, 0, 1)
+        inside = jnp.where(off_wall < 8.0, inside, 0.0)
+        on = jnp.clip(0.5 - shape(a / 0.6, b / 0.6) * 0.6 * sharp, 0, 1)
+        face = posters.colour[number] * (1 - on)[..., None] + jnp.array([215.0, 245.0, 240.0]) * on[..., None]
+        picture = picture + inside[..., None] * (face - picture)
+    return picture
 
 
 def _items(

@@ -62,7 +62,6 @@ def make(scale: float = 1.0) -> Game:
         jnp.asarray(scale * APOTHEM * towards),
         jnp.asarray(np.stack([np.sin(angles), -np.cos(angles)], axis=1).astype(np.float32)),
         jnp.asarray(POSTER_COLOURS),
-        jnp.arange(8, dtype=jnp.int32),
     )
 
     def spawn(key: Array) -> Body:
