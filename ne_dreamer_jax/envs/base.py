@@ -183,7 +183,8 @@ def from_core(core: Core) -> Env:
     def prepare(key: Array) -> EnvState:
         # What stands in the core is never used: a step from a state that needs a reset starts an episode.
         # Copies, so that the state may be donated.
-        blank = core.blank() if core.blank is not None else jax.tree.map(_zeros, jax.eval_shape(core.reset, key))
+        zeros = lambda x: jnp.zeros(x.shape, x.dtype)  # of typed keys, too
+        blank = core.blank() if core.blank is not None else jax.tree.map(zeros, jax.eval_shape(core.reset, key))
         count = lambda: jnp.zeros((), jnp.int32)
         return EnvState(jax.tree.map(jnp.copy, blank), key, count(), jnp.ones((), bool), count(), count())
 
@@ -200,12 +201,6 @@ def from_core(core: Core) -> Env:
         pictures,
         core.step_seconds,
     )
-
-
-def _zeros(x: Any) -> Array:
-    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return jnp.broadcast_to(jax.random.key(0, impl=jax.random.key_impl(x)), x.shape)
-    return jnp.zeros(x.shape, x.dtype)
 
 
 def _check_core(core: Core) -> None:

@@ -54,6 +54,23 @@ class RoomsConfig:
 
 
 @dataclass(frozen=True)
+class JaxConfig:
+    """An environment of another library that is written in JAX, see `envs.adapters`."""
+
+    task: str = "jax:gymnax/CartPole-v1"
+    image_size: ImageSize = 64
+    """Height and width of the frames, where it observes images."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps of an agent step."""
+        return 1
+
+
+@dataclass(frozen=True)
 class OwnConfig:
     """An environment of one's own, which says itself how it is observed."""
 
@@ -66,10 +83,10 @@ class OwnConfig:
         ranges.check(self)
 
 
-EnvConfig = DmcConfig | RoomsConfig | OwnConfig
+EnvConfig = DmcConfig | RoomsConfig | JaxConfig | OwnConfig
 """The settings that a configuration may choose from: which, the task's name decides."""
 
-_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, "rooms/": RoomsConfig, None: OwnConfig}
+_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, "rooms/": RoomsConfig, "jax:": JaxConfig, None: OwnConfig}
 
 
 def for_task(task: str, like: Any) -> Any:

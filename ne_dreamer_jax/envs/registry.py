@@ -21,12 +21,19 @@ class Family(NamedTuple):
     module: str
     """Has ``make(name, **options) -> Env``."""
     names: Callable[[], tuple[str, ...]]
-    """Those that can be made."""
+    """Those that can be made, as far as that is known without loading anything."""
+    check: Callable[[str], Any] | None = None
+    """Raises ValueError for a name that is none, where ``names`` does not say."""
+
+
+def _adapters() -> Any:
+    return importlib.import_module("ne_dreamer_jax.envs.adapters")  # which loads nothing by itself
 
 
 FAMILIES: dict[str, Family] = {
     "dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES),
     "rooms/": Family("ne_dreamer_jax.envs.rooms.tasks", lambda: ROOMS_NAMES),
+    "jax:": Family("ne_dreamer_jax.envs.adapters", lambda: (), lambda name: _adapters().check_installed(name)),
 }
 """Prefix -> family."""
 
@@ -65,6 +72,11 @@ def family_of(name: str) -> str | None:
 def check(name: str) -> None:
     """Raises ValueError, naming the closest matches, unless ``name`` is registered or a ``module:function``."""
     if name in names():
+        return
+    prefix = family_of(name)
+    check_name = None if prefix is None else FAMILIES[prefix].check
+    if check_name is not None:
+        check_name(name)
         return
     if ":" in name and family_of(name) is None:
         module, _, function = name.partition(":")
