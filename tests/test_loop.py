@@ -262,9 +262,10 @@ def test_states_and_the_host_give_the_pixels_back():
     assert_same(redrawn, want)
     assert_same(fetched, want)
     assert want[0][0].shape == (2, 3, 8, 8, 3)
-    assert states.capacity == host.capacity == pixels.capacity
-    assert pixels.replay_bytes - states.replay_bytes == pixels.capacity * (8 * 8 * 3 - 4)
-    assert host.frames.nbytes == pixels.capacity * 8 * 8 * 3
+    capacity = pixels.budget.capacity
+    assert states.budget.capacity == host.budget.capacity == capacity
+    assert pixels.replay_bytes - states.replay_bytes == capacity * (8 * 8 * 3 - 4)
+    assert host.frames.nbytes == capacity * 8 * 8 * 3
     assert host.replay_bytes - host.frames.nbytes == states.replay_bytes  # a ticket takes what the counter's state does
 
 

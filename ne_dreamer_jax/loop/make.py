@@ -216,7 +216,7 @@ def over_seeds(
 ) -> tuple[Callable[[Array], LoopState], Callable[[LoopState, Array], tuple[LoopState, Report]]]:
     """``init(keys [R])`` and ``chunk(state, steps)`` of R runs at once, for runs that are too small to fill a device.
 
-    State and report have a leading axis R, but for what is the same in all runs: the counters, and how full replay is.
+    State and report have a leading axis R, but for what is the same in all runs: the steps, the credit, and how full replay is.
     So each run has its own parameters, environments and replay, and does what it would do alone. ``init`` raises
     ValueError where memory can't hold R replays.
 
@@ -227,7 +227,7 @@ def over_seeds(
     shapes = loop.state_shapes()
     axes: Any = jax.tree.map(lambda _: 0, shapes)
     axes = axes._replace(
-        counters=jax.tree.map(lambda _: None, shapes.counters),
+        counters=axes.counters._replace(vector_step=None, credit=None),
         replay=replace(axes.replay, position=None, size=None),
     )
 
