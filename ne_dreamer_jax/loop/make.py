@@ -216,9 +216,9 @@ def over_seeds(
 ) -> tuple[Callable[[Array], LoopState], Callable[[LoopState, Array], tuple[LoopState, Report]]]:
     """``init(keys [R])`` and ``chunk(state, steps)`` of R runs at once, for runs that are too small to fill a device.
 
-    State and report have a leading axis R, but for what is the same in all runs: the steps, the credit, and how full replay is.
-    So each run has its own parameters, environments and replay, and does what it would do alone. ``init`` raises
-    ValueError where memory can't hold R replays.
+    State and report have a leading axis R, but for what is the same in all runs: the steps, the credit, and how full
+    replay is. So each run has its own parameters, environments and replay, and does what it would do alone. ``init``
+    raises ValueError where memory can't hold R replays.
 
     Raises ValueError for a loop that keeps images on the host, which serve one run.
     """
