@@ -69,6 +69,16 @@ class EnvState(NamedTuple):
         """The ``mjx.Data`` of a DMC task."""
         return self.core.physics
 
+    @property
+    def position(self) -> Array:
+        """Where the player of a Rooms task is, float32 [2], in DMLab's units."""
+        return self.core.position
+
+    @property
+    def yaw(self) -> Array:
+        """Where it looks, float32 [], radians, counter-clockwise from +x."""
+        return self.core.yaw
+
 
 class Env(NamedTuple):
     """An environment as pure functions, each for one environment and each jittable.

@@ -198,7 +198,8 @@ def test_two_rooms_have_cakes_and_one_room_has_none():
 def test_the_pad_teleports_for_one_and_the_choice_begins_a_new_map_with_the_same_match():
     played = Played(nonmatching.make(), 180)
     before = played.task
-    np.testing.assert_array_equal(played.state.core.position, nonmatching.START)
+    np.testing.assert_array_equal(played.state.position, nonmatching.START)
+    assert float(played.state.yaw) == 0.0
     played.put((64.0, -64.0))
     assert played.act() == 1.0
     x, y = np.asarray(played.state.core.position)

@@ -33,8 +33,8 @@ def game(name: str) -> Game:
 def make(name: str, *, image_size: int = 64, length: int | Literal["native"] | None = None) -> base.Env:
     """Makes a Rooms environment: ``image``, uint8 [image_size, image_size, 3], and nine discrete actions.
 
-    An action is held for four frames of 16 ms; rewards are summed. ``env_state.core.position`` ([2], engine units) and
-    ``env_state.core.yaw`` (radians) tell where the player is.
+    An action is held for four frames of 16 ms; rewards are summed. ``env_state.position`` ([2], engine units) and
+    ``env_state.yaw`` (radians) tell where the player is.
 
     Args:
       name: as `names.NAMES` lists them.
