@@ -178,6 +178,10 @@ def test_the_box_costs_three_lights_the_floor_and_opens_the_door_in_time():
     assert lifts[-1] == 80.0
     frames = next(i for i in range(60) if float(deferred.lift(played.task._replace(since_box=jnp.asarray(i)))) == 80.0)
     assert 15 <= frames <= 20, "16 to 20 frames from the box to a door that is open"
+    for lifted, passable in ((57.6, False), (70.4, True)):  # the door reaches 8 below the floor, a body is 56 tall
+        since = jnp.asarray(deferred.DOOR_DELAY + round(lifted / deferred.DOOR_SPEED), jnp.int32)
+        task = played.task._replace(since_box=since)
+        assert bool(deferred.solids(task).active[-1]) != passable
     played.put((300.0, 0.0))
     for _ in range(12):
         played.act(0)

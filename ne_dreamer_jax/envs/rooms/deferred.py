@@ -21,6 +21,7 @@ POINTS_1 = np.array([(-208 + 120 * i, -240 + 120 * j) for i in range(5) for j in
 POINTS_2 = np.array([(520 + 120 * i, -240 + 120 * j) for i in range(5) for j in range(5)], np.float32)
 DOOR_DELAY = 3  # frames from taking the box until the door moves: 50 ms
 DOOR_SPEED = 400.0 * 0.016  # units a frame
+SUNK = 8.0  # units that the closed door reaches below the floor
 
 APPLES, BOX, CAKES = slice(0, 10), 10, slice(11, 21)
 REWARDS = np.array([1.0] * 10 + [-3.0] + [10.0] * 10, np.float32)
@@ -61,7 +62,7 @@ def solids(task: Deferred) -> Solids:
         (x0, x1, CORRIDOR[3], ROOM_1[3] + 40), (x0, x1, ROOM_1[2] - 40, CORRIDOR[2]),
         DOOR,
     ]  # fmt: skip
-    closed = ~two | (lift(task) < BODY_HEIGHT)
+    closed = ~two | (lift(task) - SUNK < BODY_HEIGHT)
     active = jnp.concatenate([jnp.ones((6,), bool), closed[None]])
     return Solids(jnp.asarray(boxes, jnp.float32), active, jnp.zeros((0, 3), jnp.float32))
 
@@ -109,7 +110,7 @@ def make(configs: np.ndarray) -> Game:
         )
         is_door = (shown == 3)[:, None]
         colour = jnp.where(is_door, jnp.asarray(DOOR_COLOUR, jnp.float32), jnp.asarray(WALL, jnp.float32))
-        bottom = jnp.where(shown == 3, lift(task), 0.0)
+        bottom = jnp.where(shown == 3, lift(task) - SUNK, 0.0)
         items = draw.Items(
             task.items, jnp.full((21,), 6.0, jnp.float32), jnp.asarray(SIZES), jnp.asarray(KINDS), jnp.asarray(COLOURS),
             jnp.asarray(TRIMS), task.taken.there,
