@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from ne_dreamer_jax.types import Array, Metrics, Params
 
-T = TypeVar("T")
+State = TypeVar("State")
 
 SKIPPED = "skipped_updates"
 """The metric that is 1 where an update was skipped."""
@@ -29,21 +28,38 @@ def check(losses: Mapping[str, Array], gradients: Mapping[str, Params]) -> tuple
 
     Args:
       losses: name -> float32 [].
-      gradients: module -> its gradients; also those count as not finite whose squares overflow float32.
+      gradients: module -> its gradients, float32.
 
     Returns:
       bool [], and the metrics, float32 [], of this module.
     """
     sound = {f"loss/{name}": jnp.isfinite(value) for name, value in losses.items()}
-    sound |= {f"gradient/{name}": jnp.isfinite(optax.tree.norm(tree)) for name, tree in gradients.items()}
+    sound |= {f"gradient/{name}": all_finite(tree) for name, tree in gradients.items()}
     finite = jnp.stack(list(sound.values())).all()
     metrics = {f"{PREFIX}{name}": (~value).astype(jnp.float32) for name, value in sound.items()}
     return finite, metrics | {SKIPPED: (~finite).astype(jnp.float32)}
 
 
-def keep_unless(finite: Array, new: T, old: T) -> T:
-    """``new`` where the update was sound, else ``old``, bit for bit."""
-    return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+def all_finite(tree: Params) -> Array:
+    """Whether no element of a tree of float32 arrays is an infinity or NaN: bool [].
+
+    Their exponents are all ones, so their bits, less the sign, are at least those of infinity. XLA's CPU backend
+    vectorizes a maximum of integers, which makes this several times cheaper than ``isfinite``.
+    """
+    finite = jnp.ones((), bool)
+    for x in jax.tree.leaves(tree):
+        magnitude = jax.lax.bitcast_convert_type(x, jnp.int32) & 0x7FFF_FFFF
+        finite &= jnp.max(magnitude, initial=0) < 0x7F80_0000
+    return finite
+
+
+def update_if(finite: Array, update: Callable[..., State], state: State, *operands: Any) -> State:
+    """``update(state, *operands)`` where ``finite``, else ``state``, bit for bit.
+
+    A conditional: selecting between old and new arrays instead would read and write the whole state once more, which
+    costs several percent of a small agent's update on a CPU.
+    """
+    return jax.lax.cond(finite, update, lambda state, *_: state, state, *operands)
 
 
 def counted(metrics: Metrics) -> Metrics:

@@ -160,11 +160,16 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         shapes.check(_batch_shapes(config, spec, *(*batch.reward.shape, 1, 1)[:2]), batch, "the agent")
         key, loss_key = jax.random.split(state.key)
         grads, (latent, scale, metrics) = jax.grad(losses, has_aux=True)(state.params, state, loss_key, batch)
+        named = {name: metrics[f"loss/{name}"] for name in config.loss_scales}
+        finite, what_is_not = guard.check(named, grads)
+        metrics |= {"gradient_norm": optax.tree.norm(grads)} | what_is_not
+        return guard.update_if(finite, descend, state, grads, scale, key), jax.lax.stop_gradient(latent), metrics
+
+    def descend(state: TrainState, grads: Params, scale: ReturnScale, key: Array) -> TrainState:
         updates, optimizer_state = optimizer.update(grads, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        update = state.update + 1
-        rate = config.behavior.slow_rate
-        new = TrainState(
+        update, rate = state.update + 1, config.behavior.slow_rate
+        return TrainState(
             params=params,
             slow_critic=jax.tree.map(
                 lambda slow, fast: slow + rate * (fast - slow), state.slow_critic, params["critic"]
@@ -175,10 +180,6 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
             key=key,
             update=update,
         )
-        metrics["gradient_norm"] = optax.tree.norm(grads)
-        named = {name: metrics[f"loss/{name}"] for name in config.loss_scales}
-        finite, what_is_not = guard.check(named, grads)
-        return guard.keep_unless(finite, new, state), jax.lax.stop_gradient(latent), metrics | what_is_not
 
     return Agent(
         init=jax.jit(in_32_bits(init)),

@@ -148,7 +148,7 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
         )
         metrics = {"loss/critic": error, "loss/actor": loss, "loss/total": error + loss, "target": target, "noise": std}
         finite, what_is_not = guard.check({"critic": error, "actor": loss}, {**critic_grads, "actor": grads})
-        new = guard.keep_unless(finite, new, state)
+        new = guard.update_if(finite, lambda state, new: new, state, new)
         return new, nothing(batch.reward.shape[0], length), metrics | what_is_not
 
     def descend(params: Params, grads: Params, optimizer: Any) -> tuple[Params, Any]:
