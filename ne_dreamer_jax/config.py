@@ -6,11 +6,11 @@ Each part's dataclass lives beside the code that reads it; this module composes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
-from ne_dreamer_jax import settings
+from ne_dreamer_jax import objectives, settings
 from ne_dreamer_jax.agents import drqv2
 from ne_dreamer_jax.agents.dreamer.agent import AgentConfig
 from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
@@ -25,8 +25,8 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
-from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
-from ne_dreamer_jax.settings import did_you_mean, ranges
+from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding
+from ne_dreamer_jax.settings import did_you_mean, names, ranges
 from ne_dreamer_jax.settings.ranges import LARGEST, Range
 
 SIZES: dict[str, dict[str, int]] = {
@@ -60,8 +60,8 @@ class Config:
 
 
 def _check(kind: str, name: str, known: Iterable[str]) -> None:
-    if name not in (names := list(known)):
-        raise ValueError(f"no {kind} is called {name!r}. {did_you_mean(name, names)}")
+    if name not in (known := list(known)):
+        raise ValueError(f"no {kind} is called {name!r}. {did_you_mean(name, known)}")
 
 
 def agent_config(size: str) -> AgentConfig:
@@ -159,14 +159,14 @@ def with_method(config: Config, method: str) -> Config:
     Raises:
       ValueError: an unknown method, or a world-model method for a config that has no world model to begin with.
     """
-    _check("method", method, [*METHODS, "drqv2"])
+    _check("method", method, names.METHODS)
     if method == config.method:
         return config
     if isinstance(config.agent, DrQv2Config):
         raise ValueError(f"expected a config of a world-model method to make {method} of, got drqv2; take the preset's")
-    if method == "drqv2":
+    if method == names.DRQV2:
         return _drqv2(config, config.agent)
-    return _with_objective(config, config.agent, METHODS[method](config.agent.objective))
+    return _with_objective(config, config.agent, _objective(method, config.agent.objective))
 
 
 def override(config: Config, assignment: str) -> Config:
@@ -212,20 +212,17 @@ def _drqv2(config: Config, shared: AgentConfig) -> Config:
     return replace(config, env=env, agent=agent, loop=loop)
 
 
-def _next_embedding(objective: AnyObjective, **predictor: Any) -> NextEmbedding:
-    """The full method's objective, of the given one's sizes where it is of this kind."""
-    full = objective if isinstance(objective, NextEmbedding) else NextEmbedding()
-    return replace(full, predictor=replace(full.predictor, **predictor))
+def _objective(method: str, current: AnyObjective) -> AnyObjective:
+    """A world-model method's objective, with the settings of the current one where it is of the same kind.
 
-
-METHODS: dict[str, Callable[[AnyObjective], AnyObjective]] = {
-    "ne_dreamer": _next_embedding,
-    "ne_dreamer/no_transformer": lambda objective: _next_embedding(objective, layers=0),
-    "ne_dreamer/no_shift": lambda objective: replace(_next_embedding(objective), shift=0),
-    "ne_dreamer/no_projector": lambda objective: _next_embedding(objective, projector=False),
-    "dreamerv3": lambda objective: Reconstruction(),
-    "r2dreamer": lambda objective: SameStep(),
-    "dreamerpro": lambda objective: DreamerPro(),
-    "dreamer_no_reconstruction": lambda objective: NoObjective(),
-}
-"""World-model method -> its objective, made from that of a config. (``drqv2`` has none.)"""
+    Settings that ablate the current one are put back to their defaults.
+    """
+    base, _, ablation = method.partition("/")
+    kind = getattr(objectives, names.OBJECTIVES[base])
+    objective, ablations = current if isinstance(current, kind) else kind(), names.ABLATIONS.get(base, {})
+    defaults, now = settings.paths(kind()), settings.paths(objective)
+    values = {path: defaults[path] for path, ablated in ablations.values() if now[path] == ablated}
+    values |= dict([ablations[ablation]] if ablation else [])
+    for path, value in values.items():
+        objective = settings.override(objective, f"{path}={settings.as_text(value)}")
+    return objective

@@ -13,6 +13,7 @@ from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
 from ne_dreamer_jax.replay import ring as replay
+from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
 from tests import tiny
 from tests.tiny import assert_same
@@ -44,7 +45,7 @@ def test_parameter_counts_are_those_of_the_authors_code(method):
     own, target = OWN[method]
     assert parameter_counts(state.params) == {**SHARED, "encoder": 220_416, "objective": own}
     assert sum(x.size for x in jax.tree.leaves(state.target) if x.dtype == jnp.float32) == target
-    assert set(OWN) == {name for name in configs.METHODS if "/" not in name}
+    assert set(OWN) == set(names.OBJECTIVES)
 
 
 def test_a_fresh_state_is_float32_and_starts_at_zero():

@@ -43,11 +43,6 @@ class ObjectiveConfig(Protocol):
         """The losses that `build`'s objective returns, each with the weight that the method's authors give it."""
         ...
 
-    @property
-    def method(self) -> str:
-        """Name of the method that these settings make of an agent, such as ``ne_dreamer/no_shift``."""
-        ...
-
     def build(self, model: Model) -> Objective:
         """The objective's functions."""
         ...

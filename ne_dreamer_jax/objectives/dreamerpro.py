@@ -62,11 +62,6 @@ class DreamerPro:
         """Names and weights of the losses."""
         return {"swav": 1.0, "temporal": 1.0, "norm": 1.0}
 
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "dreamerpro"
-
     def build(self, model: Model) -> Objective:
         """The objective's functions.
 

@@ -51,17 +51,10 @@ class NextEmbedding:
         return {"next_embedding": 1.0}
 
     @property
-    def method(self) -> str:
-        """Name of the method, with what is ablated or otherwise than in the paper."""
-        varied = {
-            "no_transformer": self.predictor.layers == 0,
-            "no_shift": self.shift == 0,
-            "no_projector": not self.predictor.projector,
-            f"{self.steps}_steps": self.steps > 1,
-            self.alignment: self.alignment != "barlow_twins",
-        }
-        names = "+".join(name for name, applies in varied.items() if applies)
-        return f"ne_dreamer/{names}" if names else "ne_dreamer"
+    def extensions(self) -> tuple[str, ...]:
+        """What goes beyond the paper, for the method's name."""
+        extended = {f"{self.steps}_steps": self.steps > 1, self.alignment: self.alignment != "barlow_twins"}
+        return tuple(name for name, applies in extended.items() if applies)
 
     def build(self, model: Model) -> Objective:
         """The objective's functions.

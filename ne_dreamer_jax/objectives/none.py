@@ -18,11 +18,6 @@ class NoObjective:
         """None."""
         return {}
 
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "dreamer_no_reconstruction"
-
     def build(self, model: Model) -> Objective:
         """The objective's functions."""
 

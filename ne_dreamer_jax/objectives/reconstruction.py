@@ -38,11 +38,6 @@ class Reconstruction:
         """Names and weights of the losses."""
         return {"reconstruction": 1.0}
 
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "dreamerv3"
-
     def build(self, model: Model) -> Objective:
         """The objective's functions. Raises ValueError where the blocks don't divide the sizes."""
         nets = model.nets

@@ -39,11 +39,6 @@ class SameStep:
         """Names and weights of the losses."""
         return {"same_step": 0.05}
 
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "r2dreamer"
-
     def build(self, model: Model) -> Objective:
         """The objective's functions."""
         projector = Linear(model.nets.embedding, use_bias=False, dtype=model.nets.dtype)

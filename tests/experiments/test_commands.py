@@ -143,7 +143,6 @@ def test_help_names_every_preset_method_size_and_task():
 
 def test_light_names_are_those_of_the_configuration():
     assert set(names.PRESETS) == set(configs.PRESETS)
-    assert set(names.METHODS) == {*configs.METHODS, "drqv2"}
     assert set(names.SIZES) == set(configs.SIZES)
 
 

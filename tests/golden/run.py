@@ -28,13 +28,14 @@ from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding
 from ne_dreamer_jax.replay import ring as replays
+from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, Batch, ContinuousAction, EnvSpec, Latent, Transition
 
 HERE = Path(__file__).parent
 REPLAY, LOSSES = HERE / "replay.npz", HERE / "losses.npz"
 TASK, SIDE, ENVS, STEPS = "dmc/cartpole_swingup", 16, 4, 96
 UPDATES = 200
-METHODS = (*(name for name in configs.METHODS if "/" not in name), "drqv2")
+METHODS = tuple(name for name in names.METHODS if "/" not in name)
 FLAGS = ("is_first", "is_last", "is_terminal")
 
 

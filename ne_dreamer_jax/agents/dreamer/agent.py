@@ -24,7 +24,7 @@ from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
-from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings import names, ranges
 from ne_dreamer_jax.settings.ranges import NonNegative, Range
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import (
@@ -87,7 +87,7 @@ class AgentConfig:
     @property
     def method(self) -> str:
         """Name of the method that these settings are."""
-        return self.objective.method
+        return names.method_of(self.objective)
 
     @property
     def latent_sizes(self) -> tuple[int, int, int]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings import names, ranges
 from ne_dreamer_jax.settings.ranges import Count, CountOrNone, NonNegative, Positive, Range, Share, Width
 
 DIFFICULTY = {
@@ -99,7 +99,7 @@ class DrQv2Config:
     @property
     def method(self) -> str:
         """Name of the method that these settings are."""
-        return "drqv2"
+        return names.DRQV2
 
 
 def for_task(task: str) -> DrQv2Config:
