@@ -82,6 +82,23 @@ def cue(delay: int = 4) -> Probe:
     return Probe(make(delay + 1, 1, first, observe, step), delay + 1, 1.0, 0.5)
 
 
+def cue_again(delay: int = 4) -> Probe:
+    """As `cue`, but the last observation, after the action, shows the sign again, as a door that opens might.
+
+    What a later observation depends on is asked for by predicting observations or their embeddings; in `cue` only the
+    reward asks for it. Blind: as in `cue`.
+    """
+
+    def step(state: State, action: Array) -> tuple[Array, Array]:
+        return state.memory, equals(state.t, delay) * positive(action * state.memory)
+
+    def observe(state: State) -> Array:
+        return vector((equals(state.t, 0) + equals(state.t, delay + 1)) * state.memory[0], equals(state.t, delay))
+
+    first = lambda key: jax.random.rademacher(key, (1,), jnp.float32)
+    return Probe(make(delay + 1, 1, first, observe, step), delay + 1, 1.0, 0.5)
+
+
 def target(length: int = 4) -> Probe:
     """An episode shows a number in [-1, 1]; the return is 1 minus the mean distance of the actions from it.
 
@@ -179,6 +196,7 @@ PROBES: dict[str, Callable[[], Probe]] = {
     "bandit": bandit,
     "two_steps": two_steps,
     "cue": cue,
+    "cue_again": cue_again,
     "target": target,
     "echo": echo,
 }

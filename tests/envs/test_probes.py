@@ -14,6 +14,7 @@ BEST = {
     "bandit": lambda seen, first: jnp.ones((EPISODES, 1)),
     "two_steps": lambda seen, first: jnp.ones((EPISODES, 1)),
     "cue": lambda seen, first: first[:, :1],
+    "cue_again": lambda seen, first: first[:, :1],
     "target": lambda seen, first: seen[:, :1],
     "echo": lambda seen, first: -jnp.sign(seen[:, :1]),
 }
@@ -21,6 +22,7 @@ BLIND = {
     "bandit": lambda key: jax.random.uniform(key, (EPISODES, 1), minval=-1.0),
     "two_steps": lambda key: -jnp.ones((EPISODES, 1)),
     "cue": lambda key: jnp.ones((EPISODES, 1)),
+    "cue_again": lambda key: jnp.ones((EPISODES, 1)),
     "target": lambda key: jnp.zeros((EPISODES, 1)),
     "echo": lambda key: jax.random.uniform(key, (EPISODES, 1), minval=-1.0),
 }
@@ -65,11 +67,16 @@ def test_the_best_policy_has_the_optimum_and_one_without_the_ability_what_is_sai
     assert returns.mean() == pytest.approx(probe.blind, abs=0.08)
 
 
-def test_the_cue_is_gone_when_it_counts():
-    probe = probes.cue(delay=4)
+@pytest.mark.parametrize("again", [False, True])
+def test_the_cue_is_gone_when_it_counts(again):
+    probe = probes.cue_again(delay=4) if again else probes.cue(delay=4)
     state, timestep = probe.env.reset(jax.random.key(0))
-    assert abs(float(timestep.obs["vector"][0])) == 1.0
+    sign = float(timestep.obs["vector"][0])
+    assert abs(sign) == 1.0
     for _ in range(4):
         state, timestep = probe.env.step(state, jnp.zeros((1,)))
         assert float(timestep.obs["vector"][0]) == 0.0
     assert float(timestep.obs["vector"][1]) == 1.0
+    _, timestep = probe.env.step(state, jnp.zeros((1,)))
+    assert timestep.is_last
+    assert float(timestep.obs["vector"][0]) == (sign if again else 0.0)
