@@ -10,6 +10,7 @@ import numpy as np
 import ne_dreamer_jax as nedreamer
 from experiments import train
 from ne_dreamer_jax import make_agent
+from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.settings import names
 from tests.experiments import toy
 
@@ -47,10 +48,12 @@ def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny = toy.config()
     monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
-    (code,) = blocks("### Your own environment")
+    monkeypatch.setattr(registry, "_registered", {})
     made = {}
-    exec(compile(code, "README.md", "exec"), made)
+    for code in blocks("### Your own environment"):
+        exec(compile(code, "README.md", "exec"), made)
     assert (tmp_path / "runs" / "corridor" / "evaluation.json").exists()
+    assert nedreamer.load("runs/named").config.env.task == "mine/corridor"
     env = made["corridor"]()
     state, _ = env.reset(jax.random.key(0))
     for _ in range(6):  # to the right, as far as any corridor goes
@@ -59,6 +62,16 @@ def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
             break
     assert timestep.is_terminal
     assert float(timestep.reward) == 1.0
+
+
+def test_the_readmes_loop_acts():
+    _, code = blocks("## As a library")
+    env, key = toy.env(), jax.random.key(0)
+    agent = make_agent(toy.config().agent, env.spec)
+    given = {"env": env, "agent": agent, "state": agent.init(key), "jax": jax, "keys": jax.random.split(key, 2)}
+    exec(compile(code.replace("500", "3"), "README.md", "exec"), given)
+    assert given["timestep"].reward.shape == (2,)
+    assert (given["env_state"].steps == 2).all()
 
 
 def test_the_readmes_episodes_are_learned_from():

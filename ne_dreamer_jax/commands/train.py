@@ -184,6 +184,8 @@ def configure(
         config = presets.override(config, f"env.task={task}")
     if method is not None:
         config = presets.with_method(config, method)
+    if values.get("env.obs") is not None and not hasattr(config.env, "obs"):
+        raise ValueError(f"--obs: {config.env.task} says itself how it is observed; expected a dmc/ task for it")
     for path, value in values.items():
         if value is not None:
             config = presets.override(config, f"{path}={value}")

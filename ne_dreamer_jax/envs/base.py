@@ -122,8 +122,9 @@ def restart_or_step(
     """
 
     def step_or_restart(state: CoreState, action: Array, restart: Array, key: Array) -> tuple[CoreState, Progress]:
-        state, progress = step(state, action, key) if stochastic else step(state, action)
-        return if_needed(restart, lambda: reset(key), state), progress
+        stepped, progress = step(state, action, key) if stochastic else step(state, action)
+        expect_same("the state that step returns", jax.eval_shape(lambda: state), jax.eval_shape(lambda: stepped))
+        return if_needed(restart, lambda: reset(key), stepped), progress
 
     return step_or_restart
 

@@ -113,8 +113,9 @@ def make(config: Any) -> Any:
     if isinstance(config, OwnConfig):
         if config.task == GIVEN:
             raise ValueError(
-                "this run was made with an environment given in code: give it again (env=...), or train with "
-                "--task module:function or a name given to envs.register, which the run then remembers"
+                "this run was made with an environment given in code, which no command can make: give it again, as "
+                "ne_dreamer_jax.evaluate(run, env=...) or train(..., env=...) in Python. A run that was trained with "
+                "--task module:function, or under a name given to register, remembers its environment"
             )
         return registry.make(config.task)
     options = {field.name: getattr(config, field.name) for field in fields(config) if field.name != "task"}

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ne_dreamer_jax.envs.base import Env, EnvState
+from ne_dreamer_jax.envs.vector import check_env
 from ne_dreamer_jax.types import Array, ContinuousAction, TimeStep
 
 Kind = Literal["key", "dtype", "shape", "bound", "flag", "determinism", "compilation", "error"]
@@ -88,7 +89,11 @@ def findings(
       num_steps: steps before a restart is forced, and after it.
       beginning_steps: steps for which episodes that begin in different ways are compared.
       echo: takes a line on each part of the check, before it begins.
+
+    Raises:
+      ValueError: ``env`` is not an environment but what one might be made of.
     """
+    check_env(env)
     report = _Report()
     echo("Looking at shapes and dtypes.")
     try:

@@ -96,7 +96,10 @@ def make(name: str, **options: Any) -> Any:
     if prefix is not None:
         return importlib.import_module(FAMILIES[prefix].module).make(name, **options)
     if options:
-        raise ValueError(f"{name}: expected no options for an environment of one's own, got {', '.join(options)}")
+        raise ValueError(
+            f"{name}: expected no options for an environment of one's own, which says itself how it is observed; got "
+            f"{', '.join(options)}. config.override(config, 'env.task={name}') puts it in a configuration"
+        )
     return (_registered.get(name) or _imported(name))()
 
 

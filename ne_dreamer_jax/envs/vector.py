@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from ne_dreamer_jax.envs.base import Env, Pictures
+from ne_dreamer_jax.envs.base import Core, Env, Pictures
 from ne_dreamer_jax.types import Array, EnvSpec, TimeStep
 
 
@@ -51,3 +51,17 @@ def vectorize(env: Env) -> VectorEnv:
         pictures=pictures,
         step_seconds=env.step_seconds,
     )
+
+
+def check_env(env: Any) -> None:
+    """Raises ValueError where ``env`` is no environment, saying what to make of it."""
+    if isinstance(env, Env | VectorEnv):
+        return
+    what = f"expected an envs.base.Env (or an envs.vector.VectorEnv), got a {type(env).__name__}"
+    if callable(env) and not isinstance(env, tuple):
+        raise ValueError(f"env: {what}; call it, and give what it returns")
+    if {"simulation", "observe"} <= set(getattr(env, "_fields", ())):
+        raise ValueError(f"env: {what}; envs.dmc.from_task(task) makes one of it")
+    if isinstance(env, Core):
+        raise ValueError(f"env: {what}; envs.base.from_core(core) makes one of it")
+    raise ValueError(f"env: {what}; see envs.base.from_core, and envs.adapters for those of other libraries")

@@ -43,7 +43,9 @@ def train(
       logdir: the run's directory, made if need be.
       env: an environment of one's own, an ``envs.base.Env`` (``env.spec``, ``env.reset``, ``env.step``, ...; see
         ``envs.base.from_core``), in place of the one that the configuration names. The run's ``config.json`` then says
-        that the environment was given in code: to go on and to evaluate, give it again.
+        that the environment was given in code: to go on and to evaluate, give it again. Where each of its steps is
+        several of the simulation's, say so with ``env=envs.config.OwnConfig(action_repeat=...)`` in ``config``; else
+        ``loop.env_steps`` counts its own steps.
       checkpoint_minutes: time between checkpoints.
       mesh: of ``system.parallel.make_mesh``, to train on several devices.
       echo: takes the lines for people; ``lambda line: None`` for none.

@@ -364,8 +364,9 @@ def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
         lines = [f"{name}: expected {_words(expected.get(name))}, got {_words(got.get(name))}" for name in different]
         more = [f"and {len(lines) - 5} more"] if len(lines) > 5 else []
         raise ValueError(
-            f"{checkpoint.path} holds another {item} than this configuration makes; "
-            f"load it with the configuration it was saved under.\n  " + "\n  ".join([*lines[:5], *more])
+            f"{checkpoint.path} holds another {item} than this configuration makes in this environment; "
+            f"load it with the configuration, and in an environment with the observations and actions, that it was "
+            f"saved under.\n  " + "\n  ".join([*lines[:5], *more])
         )
 
 

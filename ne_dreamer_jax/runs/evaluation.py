@@ -15,7 +15,7 @@ from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.config import OwnConfig
-from ne_dreamer_jax.envs.vector import VectorEnv, vectorize
+from ne_dreamer_jax.envs.vector import VectorEnv, check_env, vectorize
 from ne_dreamer_jax.loop.play import Evaluation, make_play
 from ne_dreamer_jax.runs import checkpoint, pictures, run_directory, video
 from ne_dreamer_jax.runs.run_directory import RunDirectory
@@ -59,6 +59,7 @@ def load(run: str | Path, env: Any = None, prefer: Prefer = "best") -> Loaded:
             f"{path} is a run of {config.env.task}; expected no other environment for it. To see how its agent does "
             "elsewhere, load it without env, and step the other environment with loaded.agent.act"
         )
+    check_env(env)
     agent = make_agent(config.agent, env.spec)
     like = jax.eval_shape(agent.init, jax.random.key(0))
     restored = checkpoint.restore(RunDirectory(path).checkpoints, {"agent": like}, prefer=prefer)
@@ -164,8 +165,14 @@ def _video(
 def own(config: Config, env: Any) -> Config:
     """The configuration of a run on an environment that is given as an object: it says so.
 
-    Each of its steps counts for one environment step, unless the configuration is of such a run already.
+    Each of its steps counts for one environment step, unless the configuration says otherwise in an `OwnConfig`.
+
+    Raises:
+      ValueError: what is given is no environment.
     """
-    if env is None or isinstance(config.env, OwnConfig):
+    if env is None:
+        return config
+    check_env(env)
+    if isinstance(config.env, OwnConfig):
         return config
     return replace(config, env=OwnConfig())

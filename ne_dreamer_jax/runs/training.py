@@ -329,5 +329,8 @@ def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
         lines.append(f"  {files.curve}: the learning curve")
     if files.video.exists():
         lines.append(f"  {files.video}: an episode of the policy")
-    lines.append(f"  python -m ne_dreamer_jax evaluate {typed(files.path)}: more episodes")
+    if run.config.env == OwnConfig(action_repeat=run.config.env.action_repeat):  # no command can make it
+        lines.append(f"  ne_dreamer_jax.evaluate({str(files.path)!r}, env=...) in Python: more episodes")
+    else:
+        lines.append(f"  python -m ne_dreamer_jax evaluate {typed(files.path)}: more episodes")
     return lines

@@ -387,6 +387,7 @@ def test_what_is_no_model_is_refused():
 
 SHAPES = {
     "no reward": ({"reward": lambda data, _: data.qpos[:1]}, r"task.reward: expected a single number"),
+    "no array": ({"observe": lambda data, _: {"x": "far"}}, r"task.observe: expected 'x' to be an array of numbers"),
     "no dict": ({"observe": lambda data, _: data.qpos}, r"task.observe: expected a dict of names and arrays"),
     "a matrix": (
         {"observe": lambda data, _: {"x": data.xmat}},

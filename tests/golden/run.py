@@ -123,9 +123,12 @@ def losses(method: str, updates: int = UPDATES) -> dict[str, np.ndarray]:
 
 
 def stored(method: str) -> dict[str, np.ndarray]:
-    """What `losses` was when ``losses.npz`` was written."""
+    """What `losses` was when ``losses.npz`` was written. Raises KeyError where the method was none yet."""
     with np.load(LOSSES) as file:
-        return {name.removeprefix(f"{method}:"): file[name] for name in file.files if name.startswith(f"{method}:")}
+        found = {name.removeprefix(f"{method}:"): file[name] for name in file.files if name.startswith(f"{method}:")}
+    if not found:
+        raise KeyError(f"no run of {method} is stored; python -m tests.golden.run --write --method {method} stores one")
+    return found
 
 
 @click.command()

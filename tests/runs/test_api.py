@@ -169,3 +169,27 @@ def test_play_keeps_what_was_seen_and_done(given):
     assert not steps.counts[toy.LENGTH + 1 :].any()
     np.testing.assert_allclose((steps.reward * steps.counts).sum(0), played.returns, rtol=1e-6)
     assert steps.latent.deter.shape[:2] == steps.action.shape[:2] == steps.counts.shape
+
+
+@pytest.mark.parametrize(
+    ("given", "advice"),
+    [
+        (toy.env, "got a function; call it"),
+        (base.Core(toy.env().spec, None, None, None), "got a Core; envs.base.from_core"),
+        ("toy", "got a str; see envs.base.from_core"),
+    ],
+)
+def test_what_is_no_environment_is_refused_with_what_to_make_of_it(tmp_path, given, advice):
+    with pytest.raises(ValueError, match=advice):
+        nedreamer.train(toy.config(), tmp_path / "run", env=given, echo=quiet)
+    with pytest.raises(ValueError, match=advice):
+        envs.conformance.check(given, jax.random.key(0), echo=quiet)
+
+
+def test_a_step_that_returns_another_state_than_reset_is_named():
+    spec = toy.env().spec
+    step = lambda state, action: (state[0], base.Progress(*jnp.zeros((4,))))
+    with pytest.raises(ValueError, match="the state that step returns: expected the structure"):
+        base.from_core(
+            base.Core(spec, lambda key: (jnp.zeros(2),), base.restart_or_step(lambda key: (jnp.zeros(2),), step), None)
+        )

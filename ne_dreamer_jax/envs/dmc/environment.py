@@ -120,8 +120,11 @@ def _check_parts(task: Task, initial: mjx.Data) -> None:
     def begin(key: Array) -> Any:
         result = task.reset(key)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], mjx.Data)):
+            got = _kind(result)
+            if isinstance(result, tuple):
+                got = f"a tuple of {', '.join(map(_kind, result)) or 'nothing'}"
             raise ValueError(
-                f"task.reset: expected a pair of an mjx.Data and what the episode draws, got {_kind(result)}; where it "
+                f"task.reset: expected a pair of an mjx.Data and what the episode draws, got {got}; where it "
                 "draws nothing else, return data, ()"
             )
         drawn.extend(name for name in _CONSEQUENCES if _differs(getattr(initial, name), getattr(result[0], name)))
@@ -134,7 +137,10 @@ def _check_parts(task: Task, initial: mjx.Data) -> None:
     wanted: Any = jax.tree.structure(task.episode)
     got: Any = jax.tree.structure(episode)
     if wanted != got:
-        raise ValueError(f"task.reset: expected it to draw what task.episode is an example of, {wanted}, got {got}")
+        raise ValueError(
+            f"task.reset: expected it to draw what task.episode is an example of, {wanted}, got {got}; give the task "
+            "an example of what its reset draws, as episode="
+        )
     base.expect_same("task.reset: what the episode draws", jax.eval_shape(lambda: _arrays(task.episode)), episode)
     number: Any = jax.eval_shape(task.reward, initial, _arrays(task.episode))
     if getattr(number, "shape", None) != ():
@@ -184,7 +190,7 @@ def _reads_forces(task: Task, initial: mjx.Data) -> bool:
     def read(leaves: list[Any], episode: Episode) -> Any:
         data = jax.tree.unflatten(structure, leaves)
         ends = () if task.terminal is None else task.terminal(data, episode)
-        return task.reward(data, episode), task.observe(data, episode), ends
+        return task.reward(data, episode), _as_arrays(task.observe(data, episode)), ends
 
     jaxpr = jax.make_jaxpr(read)([leaf for _, leaf in leaves], episode).jaxpr
     used = {id(var) for equation in jaxpr.eqns for var in equation.invars} | {id(var) for var in jaxpr.outvars}
@@ -207,7 +213,9 @@ def _make_observe(
             redraw=lambda vector: render.draw(scene, render.recorded(scene, vector)),
         )
     if obs != "pixels":
-        vectors: Any = jax.eval_shape(task.observe, task.simulation.initial(), task.episode)
+        vectors: Any = jax.eval_shape(
+            lambda data, episode: _as_arrays(task.observe(data, episode)), task.simulation.initial(), task.episode
+        )
         _check_vectors(vectors, taken=spec)
         spec |= {name: ArraySpec(value.shape, jnp.float32) for name, value in vectors.items()}
 
@@ -223,10 +231,21 @@ def _make_observe(
     return spec, observe, pictures
 
 
-def _check_vectors(vectors: Any, taken: Mapping[str, Any]) -> None:
-    """Raises ValueError where these are no observations of a task beside those whose names are taken."""
+def _as_arrays(vectors: Any) -> Any:
+    """A task's observations as arrays. Raises ValueError where one can't be made an array."""
     if not isinstance(vectors, Mapping):
         raise ValueError(f"task.observe: expected a dict of names and arrays, got {type(vectors).__name__}")
+    arrays = {}
+    for name, value in vectors.items():
+        try:
+            arrays[name] = jnp.asarray(value, jnp.float32)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"task.observe: expected {name!r} to be an array of numbers, got {value!r}") from error
+    return arrays
+
+
+def _check_vectors(vectors: Any, taken: Mapping[str, Any]) -> None:
+    """Raises ValueError where these are no observations of a task beside those whose names are taken."""
     for name, value in vectors.items():
         if name in taken:
             raise ValueError(f"task.observe: expected another name than {name!r}, which the pixels have")
