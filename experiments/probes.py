@@ -39,6 +39,8 @@ NUM_ENVS, STEPS, CAPACITY = 8, 32, 16_384
 STEPS_PER_UPDATE = 8
 PREFILL = 4
 """Rounds of `STEPS` that are played before the first with updates."""
+EVALUATION = 2**31 - 1
+"""The seed of the episodes of evaluations."""
 
 WORLD_MODEL = AgentConfig(
     encoder=EncoderConfig(depth=8, layers=1, units=32),
@@ -102,7 +104,9 @@ class Trainer:
         """
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         play = jax.jit(jax.vmap(functools.partial(self._collect, probe.env)), donate_argnums=2)
-        state, *playing, ring = jax.jit(jax.vmap(functools.partial(self._init, probe.env)))(keys)
+        split = jax.vmap(jax.random.split)(keys)
+        keys, init_keys = split[:, 0], split[:, 1]
+        state, playing, ring = jax.jit(jax.vmap(functools.partial(self._init, probe.env)))(init_keys)
         history, rounds = [], -(-updates // (STEPS * NUM_ENVS // STEPS_PER_UPDATE))
         for number in range(PREFILL + rounds):
             split = jax.vmap(lambda key: jax.random.split(key, 3))(keys)
@@ -115,8 +119,9 @@ class Trainer:
 
     def evaluate(self, probe: probes.Probe, params: Params, episodes: int = 256) -> np.ndarray:
         """Mean returns ``[R]`` of the policy's mode, over whole episodes, for parameters ``[R, ...]``."""
-        env_state = jax.vmap(probe.env.prepare)(jax.random.split(jax.random.key(99), episodes))
-        policy, key = self.agent.init_policy(episodes), jax.random.key(98)
+        env_key, key = jax.random.split(jax.random.key(EVALUATION))
+        env_state = jax.vmap(probe.env.prepare)(jax.random.split(env_key, episodes))
+        policy = self.agent.init_policy(episodes)
         play = jax.jit(jax.vmap(lambda params: self._play(probe.env, "mode", params, (env_state, policy), key)[1]))
         seen = play(params)
         whole = STEPS // (probe.length + 1) * (probe.length + 1)  # all episodes begin and end together
@@ -124,12 +129,13 @@ class Trainer:
         assert (last == episodes * (whole // (probe.length + 1))).all()
         return reward / last
 
-    def _init(self, env: base.Env, key: Array) -> tuple[Any, Any, Any, replay.Replay]:
-        state, policy = self.agent.init(key), self.agent.init_policy(NUM_ENVS)
-        env_state = jax.vmap(env.prepare)(jax.random.split(key, NUM_ENVS))
-        seen = jax.eval_shape(lambda: self._play(env, "sample", state.params, (env_state, policy), key)[1])
+    def _init(self, env: base.Env, key: Array) -> tuple[Any, Any, replay.Replay]:
+        agent_key, env_key = jax.random.split(key)
+        state = self.agent.init(agent_key)
+        playing = (jax.vmap(env.prepare)(jax.random.split(env_key, NUM_ENVS)), self.agent.init_policy(NUM_ENVS))
+        seen = jax.eval_shape(lambda: self._play(env, "sample", state.params, playing, key)[1])
         row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), seen)
-        return state, env_state, policy, replay.init(row, CAPACITY, NUM_ENVS)
+        return state, playing, replay.init(row, CAPACITY, NUM_ENVS)
 
     def _play(self, env: base.Env, mode: str, params: Params, playing: Any, key: Array) -> tuple[Any, Transition]:
         """`STEPS` vector steps: environment and policy states after them, and what was seen ``[STEPS, N, ...]``."""
@@ -140,7 +146,7 @@ class Trainer:
             policy, action = self.agent.act(params, policy, timestep, key, mode=mode)
             return (env_state, policy), transition(timestep, policy, action)
 
-        return jax.lax.scan(step, tuple(playing), jax.random.split(key, STEPS))
+        return jax.lax.scan(step, playing, jax.random.split(key, STEPS))
 
     def _collect(self, env: base.Env, params: Params, playing: Any, ring: replay.Replay, key: Array) -> Any:
         playing, seen = self._play(env, "sample", params, playing, key)
@@ -150,8 +156,10 @@ class Trainer:
         def update(carry: Any, key: Array) -> tuple[Any, Metrics]:
             state, ring = carry
             batch = replay.sample(ring, key, self.config.batch_size, self.config.batch_length)
+            before = state.update
             state, latents, metrics = self.agent.train_step(state, batch)
-            return (state, replay.write_latents(ring, batch.index, latents)), metrics
+            ring = replay.write_latents(ring, batch.index, latents, where=state.update > before)
+            return (state, ring), metrics
 
         keys = jax.random.split(key, STEPS * NUM_ENVS // STEPS_PER_UPDATE)
         (state, ring), metrics = jax.lax.scan(update, (state, ring), keys)

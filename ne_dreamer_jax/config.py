@@ -150,6 +150,9 @@ def preset(name: str, size: str | None = None) -> Config:
 def with_method(config: Config, method: str) -> Config:
     """The config with another of the paper's methods; what the methods share stays as the config has it.
 
+    Settings that made an ablation of the config's method are put back to their defaults, which may be others than a
+    preset's: choose the method of a preset, not of an ablation of it.
+
     The weights of the method's own losses are its authors', unless the config weighs losses of these names already.
 
     ``drqv2`` shares the environment and the budget: it is as its authors have it for the task, at their image size
@@ -213,13 +216,10 @@ def _drqv2(config: Config, shared: AgentConfig) -> Config:
 
 
 def _objective(method: str, current: AnyObjective) -> AnyObjective:
-    """A world-model method's objective, with the settings of the current one where it is of the same kind.
-
-    Settings that ablate the current one are put back to their defaults.
-    """
+    """A world-model method's objective, with the settings of the current one where it is of the same kind."""
     base, _, ablation = method.partition("/")
     kind = getattr(objectives, names.OBJECTIVES[base])
-    objective, ablations = current if isinstance(current, kind) else kind(), names.ABLATIONS.get(base, {})
+    objective, ablations = current if type(current) is kind else kind(), names.ABLATIONS.get(base, {})
     defaults, now = settings.paths(kind()), settings.paths(objective)
     values = {path: defaults[path] for path, ablated in ablations.values() if now[path] == ablated}
     values |= dict([ablations[ablation]] if ablation else [])

@@ -9,7 +9,7 @@ import pytest
 
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import make_agent
-from ne_dreamer_jax.agents.guard import PREFIX, SKIPPED
+from ne_dreamer_jax.agents.guard import PREFIX, SKIPPED, is_sound
 from ne_dreamer_jax.envs import base
 from tests import tiny
 from tests.drqv2 import small
@@ -66,6 +66,13 @@ def test_a_gradient_that_is_not_finite_where_the_loss_is_changes_nothing(agent):
     new, _, metrics = agent.train_step(state._replace(params=params), tiny.batch(tiny.VECTORS))
     assert bits(new) == before
     assert metrics[f"{PREFIX}gradient/encoder"] == 1
+
+
+@pytest.mark.parametrize("value", [jnp.nan, -jnp.nan, jnp.inf, -jnp.inf, 2.0**50, -1e30])
+def test_one_element_makes_a_tree_unsound(value):
+    tree = {"a": jnp.asarray([-0.0, 1e-42, -(2.0**49)]), "b": jnp.zeros((0, 3)), "c": jnp.zeros((4, 4))}
+    assert is_sound(tree)
+    assert not is_sound({**tree, "c": tree["c"].at[2, 1].set(value)})
 
 
 def test_drqv2_skips_likewise():

@@ -123,7 +123,7 @@ def restart_or_step(
 
     def step_or_restart(state: CoreState, action: Array, restart: Array, key: Array) -> tuple[CoreState, Progress]:
         stepped, progress = step(state, action, key) if stochastic else step(state, action)
-        expect_same("the state that step returns", jax.eval_shape(lambda: state), jax.eval_shape(lambda: stepped))
+        _expect_structure("the state that step returns", state, stepped)  # dtypes may yet be promoted
         return if_needed(restart, lambda: reset(key), stepped), progress
 
     return step_or_restart
@@ -248,12 +248,16 @@ def expect_same(what: str, expected: Any, got: Any) -> None:
         and got.
     """
     leaves, others = (jax.tree_util.tree_flatten_with_path(tree)[0] for tree in (expected, got))
+    _expect_structure(what, expected, got)
+    for (path, leaf), (_, other) in zip(leaves, others, strict=True):
+        _expect(f"{what}{jax.tree_util.keystr(path)}", _described(leaf), _described(other))
+
+
+def _expect_structure(what: str, expected: Any, got: Any) -> None:
     structure: Any = jax.tree.structure(expected)
     other_structure: Any = jax.tree.structure(got)
     if structure != other_structure:
         raise ValueError(f"{what}: expected the structure {structure}, got {other_structure}")
-    for (path, leaf), (_, other) in zip(leaves, others, strict=True):
-        _expect(f"{what}{jax.tree_util.keystr(path)}", _described(leaf), _described(other))
 
 
 def _expect_arrays(what: str, tree: Any) -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ne_dreamer_jax.envs.base import Env, EnvState
-from ne_dreamer_jax.envs.vector import check_env
+from ne_dreamer_jax.envs.vector import VectorEnv, check_env
 from ne_dreamer_jax.types import Array, ContinuousAction, TimeStep
 
 Kind = Literal["key", "dtype", "shape", "bound", "flag", "determinism", "compilation", "error"]
@@ -94,6 +94,8 @@ def findings(
       ValueError: ``env`` is not an environment but what one might be made of.
     """
     check_env(env)
+    if isinstance(env, VectorEnv):
+        raise ValueError("env: expected a single environment, an envs.base.Env, got a VectorEnv")
     report = _Report()
     echo("Looking at shapes and dtypes.")
     try:

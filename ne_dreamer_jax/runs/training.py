@@ -27,6 +27,7 @@ from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import OwnConfig
+from ne_dreamer_jax.envs.vector import check_env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
@@ -70,6 +71,7 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
         env = env_configs.make(config.env)
     elif not isinstance(config.env, OwnConfig):
         config = replace(config, env=OwnConfig(action_repeat=config.env.action_repeat))
+    check_env(env)
     agent = make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
     return Run(config, agent, loop, loop.state_shapes(), env.step_seconds)

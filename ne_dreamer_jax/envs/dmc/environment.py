@@ -43,6 +43,7 @@ def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base
     _check_numbers(task)
     initial = simulation.initial()
     _check_parts(task, initial)
+    spec, observe, pictures = _make_observe(task, obs, image_size)
     fresh_forces = _reads_forces(task, initial)
     time_limit = math.ceil(round(task.time_limit / simulation.control_timestep, 6))  # in control steps
     low, high = simulation.mj_model.actuator_ctrlrange.astype("float32").T
@@ -94,11 +95,8 @@ def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base
         progress = base.Progress(reward, is_last=(steps_left <= 0) | ended, is_terminal=ended, is_sound=sound)
         return State(data, episode, steps_left), progress
 
-    spec, observe, pictures = _make_observe(task, obs, image_size)
-    env_spec, seconds = (
-        EnvSpec(spec, ContinuousAction(simulation.mj_model.nu)),
-        action_repeat * simulation.control_timestep,
-    )
+    env_spec = EnvSpec(spec, ContinuousAction(simulation.mj_model.nu))
+    seconds = action_repeat * simulation.control_timestep
     return base.Core(env_spec, reset, step, observe, pictures, seconds, blank)
 
 
@@ -190,7 +188,7 @@ def _reads_forces(task: Task, initial: mjx.Data) -> bool:
     def read(leaves: list[Any], episode: Episode) -> Any:
         data = jax.tree.unflatten(structure, leaves)
         ends = () if task.terminal is None else task.terminal(data, episode)
-        return task.reward(data, episode), _as_arrays(task.observe(data, episode)), ends
+        return task.reward(data, episode), task.observe(data, episode), ends
 
     jaxpr = jax.make_jaxpr(read)([leaf for _, leaf in leaves], episode).jaxpr
     used = {id(var) for equation in jaxpr.eqns for var in equation.invars} | {id(var) for var in jaxpr.outvars}
