@@ -8,10 +8,10 @@ Usage: ``python -m experiments.probes --probe cue --probe cue_again --seeds 5``
 from __future__ import annotations
 
 import dataclasses
-import functools
+import operator
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import click
 import jax
@@ -19,26 +19,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from ne_dreamer_jax import config as configs
+from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax import make_agent
+from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.agents.dreamer.agent import AgentConfig
 from ne_dreamer_jax.agents.dreamer.behavior import BehaviorConfig
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
 from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.commands.options import Name
-from ne_dreamer_jax.envs import base, probes
+from ne_dreamer_jax.envs import probes
+from ne_dreamer_jax.loop import budget
+from ne_dreamer_jax.loop.config import LoopConfig
 from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding
-from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.settings import names
-from ne_dreamer_jax.types import Array, EnvSpec, Metrics, Params, TimeStep, Transition
 
-NUM_ENVS, STEPS, CAPACITY = 8, 32, 16_384
+NUM_ENVS, CAPACITY, EPISODES = 8, 16_384, 256
 STEPS_PER_UPDATE = 8
-PREFILL = 4
-"""Rounds of `STEPS` that are played before the first with updates."""
+PREFILL = 1_024
+"""Agent steps before the first update."""
 EVALUATION = 2**31 - 1
 """The seed of the episodes of evaluations."""
 
@@ -81,108 +83,47 @@ def learner(method: str) -> AgentConfig | DrQv2Config:
     return agent
 
 
-def probe_for(method: str, name: str) -> probes.Probe:
-    """A probe as the method takes it, as pictures where it needs them."""
-    probe = probes.PROBES[name]()
-    return probes.as_picture(probe) if method in PICTURES else probe
+def make_loop(agent: Agent, probe: probes.Probe, updates: int) -> loops.Loop:
+    """The training loop with so many updates, one every `STEPS_PER_UPDATE` agent steps."""
+    config = agent.config
+    options = LoopConfig(
+        env_steps=PREFILL + updates * STEPS_PER_UPDATE,
+        num_envs=NUM_ENVS,
+        replay_ratio=budget.replay_ratio(config.batch_size, config.batch_length, STEPS_PER_UPDATE),
+        capacity=CAPACITY,
+        prefill=PREFILL,
+        eval_episodes=EPISODES,
+    )
+    return loops.make(options, probe.env, agent, action_repeat=1)
 
 
-class Trainer:
-    """An agent and its updates, compiled once for all probes, since their spec is the same."""
+class Learned(NamedTuple):
+    """What R seeds of an agent reached."""
 
-    def __init__(self, config: Any, spec: EnvSpec = probes.SPEC) -> None:
-        self.agent, self.config = make_agent(config, spec), config
-        self._learn = jax.jit(jax.vmap(self._updates), donate_argnums=(0, 1))
-
-    def train(
-        self, probe: probes.Probe, updates: int, seeds: Sequence[int] = (0,)
-    ) -> tuple[Params, list[dict[str, np.ndarray]]]:
-        """The parameters after at least so many updates, and the metrics of the last update of each round.
-
-        Returns:
-          Parameters ``[R, ...]`` of R seeds, and for each round of `STEPS` vector steps the metrics ``[R]``.
-        """
-        keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-        play = jax.jit(jax.vmap(functools.partial(self._collect, probe.env)), donate_argnums=2)
-        split = jax.vmap(jax.random.split)(keys)
-        keys, init_keys = split[:, 0], split[:, 1]
-        state, playing, ring = jax.jit(jax.vmap(functools.partial(self._init, probe.env)))(init_keys)
-        history, rounds = [], -(-updates // (STEPS * NUM_ENVS // STEPS_PER_UPDATE))
-        for number in range(PREFILL + rounds):
-            split = jax.vmap(lambda key: jax.random.split(key, 3))(keys)
-            keys, play_keys, learn_keys = split[:, 0], split[:, 1], split[:, 2]
-            playing, ring = play(state.params, playing, ring, play_keys)
-            if number >= PREFILL:
-                state, ring, metrics = self._learn(state, ring, learn_keys)
-                history.append(jax.device_get(metrics))
-        return state.params, history
-
-    def evaluate(self, probe: probes.Probe, params: Params, episodes: int = 256) -> np.ndarray:
-        """Mean returns ``[R]`` of the policy's mode, over whole episodes, for parameters ``[R, ...]``."""
-        env_key, key = jax.random.split(jax.random.key(EVALUATION))
-        env_state = jax.vmap(probe.env.prepare)(jax.random.split(env_key, episodes))
-        policy = self.agent.init_policy(episodes)
-        play = jax.jit(jax.vmap(lambda params: self._play(probe.env, "mode", params, (env_state, policy), key)[1]))
-        seen = play(params)
-        whole = STEPS // (probe.length + 1) * (probe.length + 1)  # all episodes begin and end together
-        reward, last = (np.asarray(x)[:, :whole].sum((1, 2)) for x in (seen.reward, seen.is_last))
-        assert (last == episodes * (whole // (probe.length + 1))).all()
-        return reward / last
-
-    def _init(self, env: base.Env, key: Array) -> tuple[Any, Any, replay.Replay]:
-        agent_key, env_key = jax.random.split(key)
-        state = self.agent.init(agent_key)
-        playing = (jax.vmap(env.prepare)(jax.random.split(env_key, NUM_ENVS)), self.agent.init_policy(NUM_ENVS))
-        seen = jax.eval_shape(lambda: self._play(env, "sample", state.params, playing, key)[1])
-        row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), seen)
-        return state, playing, replay.init(row, CAPACITY, NUM_ENVS)
-
-    def _play(self, env: base.Env, mode: str, params: Params, playing: Any, key: Array) -> tuple[Any, Transition]:
-        """`STEPS` vector steps: environment and policy states after them, and what was seen ``[STEPS, N, ...]``."""
-
-        def step(carry: Any, key: Array) -> tuple[Any, Transition]:
-            env_state, policy = carry
-            env_state, timestep = jax.vmap(env.step)(env_state, policy.prev_action)
-            policy, action = self.agent.act(params, policy, timestep, key, mode=mode)
-            return (env_state, policy), transition(timestep, policy, action)
-
-        return jax.lax.scan(step, playing, jax.random.split(key, STEPS))
-
-    def _collect(self, env: base.Env, params: Params, playing: Any, ring: replay.Replay, key: Array) -> Any:
-        playing, seen = self._play(env, "sample", params, playing, key)
-        return playing, jax.lax.scan(lambda ring, row: (replay.add(ring, row), None), ring, seen)[0]
-
-    def _updates(self, state: Any, ring: replay.Replay, key: Array) -> tuple[Any, replay.Replay, Metrics]:
-        def update(carry: Any, key: Array) -> tuple[Any, Metrics]:
-            state, ring = carry
-            batch = replay.sample(ring, key, self.config.batch_size, self.config.batch_length)
-            before = state.update
-            state, latents, metrics = self.agent.train_step(state, batch)
-            ring = replay.write_latents(ring, batch.index, latents, where=state.update > before)
-            return (state, ring), metrics
-
-        keys = jax.random.split(key, STEPS * NUM_ENVS // STEPS_PER_UPDATE)
-        (state, ring), metrics = jax.lax.scan(update, (state, ring), keys)
-        return state, ring, jax.tree.map(lambda x: x[-1], metrics)
+    returns: np.ndarray  # float64 [R], mean over the episodes of an evaluation
+    metrics: dict[str, np.ndarray]  # name -> [R], mean over the last tenth of the updates
 
 
-def transition(timestep: TimeStep, policy: Any, action: Array) -> Transition:
-    """A row of replay."""
-    flags = (timestep.is_first, timestep.is_last, timestep.is_terminal)
-    return Transition(timestep.obs, action, timestep.reward, *flags, policy.latent)
-
-
-@functools.cache
-def trainer(method: str) -> Trainer:
-    """A method's, made once."""
-    return Trainer(learner(method), probes.PICTURE if method in PICTURES else probes.SPEC)
+def learn(loop: loops.Loop, seeds: Sequence[int]) -> Learned:
+    """Trains with each of the seeds, all of them at once, and evaluates the policies' modes."""
+    init, chunk = loops.over_seeds(loop)
+    state = init(jnp.stack([jax.random.key(seed) for seed in seeds]))
+    last = max(1, (loop.budget.vector_steps - loop.budget.prefill) // 10)
+    for steps in (loop.budget.vector_steps - last, last):
+        state, report = chunk(state, jnp.asarray(steps, jnp.int32))
+    alone = [jax.tree.map(operator.itemgetter(i), state.train.params) for i in range(len(seeds))]
+    returns = [np.mean(loop.evaluate(params, jax.random.key(EVALUATION)).returns) for params in alone]
+    report = jax.device_get(report)
+    return Learned(np.array(returns), {name: x / report.updates for name, x in report.learning.items()})
 
 
 def returns(method: str, name: str, seeds: Sequence[int]) -> np.ndarray:
     """Mean return ``[R]`` of each seed's policy after the probe's number of updates."""
-    probe, updates = probe_for(method, name), DRQV2_UPDATES if method == names.DRQV2 else UPDATES[name]
-    params, _ = trainer(method).train(probe, updates, seeds)
-    return trainer(method).evaluate(probe, params)
+    probe = probes.PROBES[name]()
+    if method in PICTURES:
+        probe = probes.as_picture(probe)
+    agent = make_agent(learner(method), probe.env.spec)
+    return learn(make_loop(agent, probe, DRQV2_UPDATES if method == names.DRQV2 else UPDATES[name]), seeds).returns
 
 
 @click.command(help=__doc__, context_settings={"show_default": True})

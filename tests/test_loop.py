@@ -2,6 +2,7 @@
 tests run the whole agent."""
 
 import dataclasses
+import operator
 from fractions import Fraction
 from functools import partial
 from types import SimpleNamespace
@@ -202,6 +203,23 @@ def test_latents_are_stored_in_the_chosen_dtype():
     assert make(latent_dtype="bfloat16").replay_bytes < make().replay_bytes
 
 
+def test_runs_of_several_seeds_at_once_are_those_runs(learning):
+    init, chunk = loops.over_seeds(learning.loop)
+    seeds = [3, 0]
+    together = init(jnp.stack([jax.random.key(seed) for seed in seeds]))
+    assert together.replay.position.shape == together.counters.vector_step.shape == ()
+    for n in (5, STEPS - 5):
+        together, metrics = chunk(together, steps(n))
+    assert metrics.learning["update"].shape == (2,)
+    for i, seed in enumerate(seeds):
+        alone, (_, want) = ran(learning.loop, 5, STEPS - 5, seed=seed)
+        one = jax.tree.map(operator.itemgetter(i), together._replace(counters=(), replay=together.replay.data))
+        ring = dataclasses.replace(together.replay, data=one.replay)
+        counters = together.counters._replace(skipped=together.counters.skipped[i])
+        assert_same(one._replace(counters=counters, replay=ring), alone)
+        np.testing.assert_allclose(metrics.learning["update"][i], want.learning["update"])
+
+
 def test_replay_gets_nine_tenths_of_what_the_learner_leaves(monkeypatch):
     env = counting.env()
     agent = counting.stub(env.spec)
@@ -212,6 +230,14 @@ def test_replay_gets_nine_tenths_of_what_the_learner_leaves(monkeypatch):
     loops.make(dataclasses.replace(config, capacity=300), env, agent, 2)
     with pytest.raises(ValueError, match="expected a capacity of at most 300 steps"):
         loops.make(config, env, agent, 2)
+
+
+def test_more_replays_than_memory_holds_are_refused(monkeypatch):
+    loop = make()
+    monkeypatch.setattr(memory, "available", lambda: 3 * loop.replay_bytes)
+    init, _ = loops.over_seeds(loop)
+    with pytest.raises(ValueError, match="expected at most 2 seeds"):
+        init(jax.random.split(jax.random.key(0), 3))
 
 
 def test_states_and_the_host_give_the_pixels_back():
@@ -266,6 +292,8 @@ def no_platform(local_devices, *args, backend=None, **kwargs):
 def test_images_on_the_host_are_refused_where_they_can_not_be(monkeypatch):
     with pytest.raises(ValueError, match=r"loop.storage: expected 'pixels' for an environment without"):
         make(image=False, storage="host")
+    with pytest.raises(ValueError, match=r"several seeds at once, got 'host'"):
+        loops.over_seeds(make(image=True, storage="host"))
     with monkeypatch.context() as patch:
         patch.setattr(jax, "process_count", lambda: 2)
         with pytest.raises(ValueError, match=r"several processes, got 'host'"):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
 from experiments import probes as training
-from experiments.probes import DRQV2, DRQV2_UPDATES, WORLD_MODEL, Trainer
+from experiments.probes import DRQV2, DRQV2_UPDATES, WORLD_MODEL
+from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.envs import probes
 from ne_dreamer_jax.settings import names
 
@@ -31,6 +31,10 @@ UNABLE = {
 }
 
 
+def loop_of(config, probe, updates):
+    return training.make_loop(make_agent(config, probe.env.spec), probe, updates)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", probes.PROBES)
 @pytest.mark.parametrize("method", METHODS)
@@ -49,10 +53,8 @@ def test_who_should_solve_a_probe_does_and_who_lacks_the_ability_does_not(method
 @pytest.mark.slow
 def test_drqv2_solves_the_cue_once_its_stack_reaches_back_to_it():
     """So that what it lacks is memory, and nothing else."""
-    probe = probes.cue(delay=4)
-    seeing = Trainer(dataclasses.replace(DRQV2, frame_stack=5))
-    params, _ = seeing.train(probe, DRQV2_UPDATES)
-    assert seeing.evaluate(probe, params)[0] > 0.9
+    loop = loop_of(dataclasses.replace(DRQV2, frame_stack=5), probes.cue(delay=4), DRQV2_UPDATES)
+    assert training.learn(loop, [0]).returns[0] > 0.9
 
 
 @pytest.mark.slow
@@ -65,21 +67,18 @@ def test_the_next_embedding_of_an_echo_is_predicted_from_the_action_alone():
         # A policy that stays random: its last action says nothing of the next.
         behavior = dataclasses.replace(WORLD_MODEL.behavior, entropy=10.0)
         config = dataclasses.replace(WORLD_MODEL, objective=objective, behavior=behavior)
-        _, history = Trainer(config).train(probe, 600)
-        loss[action] = np.mean([line["loss/next_embedding"] for line in history[-5:]])
+        loss[action] = training.learn(loop_of(config, probe, 600), [0]).metrics["loss/next_embedding"][0]
     print(loss)
     assert loss["current"] < 0.5 * loss["previous"]
 
 
-def test_a_trainer_takes_any_learner():
+def test_seeds_learn_at_once_and_each_for_itself():
     """The driver itself, without waiting for an agent to learn."""
-    quick = Trainer(dataclasses.replace(DRQV2, batch_size=8, features=4, units=8))
-    probe = probes.target()
-    params, history = quick.train(probe, 1, seeds=(0, 1, 0))
-    assert np.isfinite(jax.tree.leaves(history[-1])).all()
-    returns = quick.evaluate(probe, params, episodes=4)
-    assert returns.shape == (3,)
-    assert (np.abs(returns) <= 1.0).all()
-    weights = np.asarray(jax.tree.leaves(params)[0])
-    np.testing.assert_array_equal(weights[0], weights[2])  # the same seed
-    assert (weights[0] != weights[1]).any()
+    loop = loop_of(dataclasses.replace(DRQV2, batch_size=8, features=4, units=8), probes.target(), 10)
+    assert loop.budget.updates == 10
+    learned = training.learn(loop, [0, 1, 0])
+    assert np.isfinite(list(learned.metrics.values())).all()
+    assert learned.returns.shape == (3,)
+    assert (np.abs(learned.returns) <= 1.0).all()
+    for values in (learned.returns, learned.metrics["loss/critic"]):
+        assert values[0] == values[2] != values[1]

@@ -53,6 +53,12 @@ def vectorize(env: Env) -> VectorEnv:
     )
 
 
+def as_vector(env: Any) -> VectorEnv:
+    """N environments at once of a single one; what is of that kind already stays as it is. Raises as `check_env`."""
+    check_env(env)
+    return env if isinstance(env, VectorEnv) else vectorize(env)
+
+
 def check_env(env: Any) -> None:
     """Raises ValueError where ``env`` is no environment, saying what to make of it."""
     if isinstance(env, Env | VectorEnv):

@@ -2,7 +2,7 @@
 
 from ne_dreamer_jax.loop.budget import Budget
 from ne_dreamer_jax.loop.config import LoopConfig
-from ne_dreamer_jax.loop.make import Loop, make
+from ne_dreamer_jax.loop.make import Loop, make, over_seeds
 from ne_dreamer_jax.loop.offline import train_offline
 from ne_dreamer_jax.loop.play import Evaluation, Steps, make_play, random_action
 from ne_dreamer_jax.loop.state import Counters, Episodes, Finished, LoopState, Report
@@ -20,6 +20,7 @@ __all__ = [
     "Steps",
     "make",
     "make_play",
+    "over_seeds",
     "random_action",
     "train_offline",
 ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from ne_dreamer_jax.agents.base import Agent
-from ne_dreamer_jax.envs.vector import VectorEnv, vectorize
+from ne_dreamer_jax.envs.vector import VectorEnv, as_vector
 from ne_dreamer_jax.loop import placement
 from ne_dreamer_jax.loop.budget import Budget
 from ne_dreamer_jax.loop.collect import collect, transition
@@ -75,7 +76,7 @@ def make(config: LoopConfig, env: Any, agent: Agent, action_repeat: int, mesh: M
     processes, or where devices can't get equal shares.
     """
     devices = placement.check_divisible(mesh, config.num_envs, agent.config.batch_size)
-    venv = env if isinstance(env, VectorEnv) else vectorize(env)
+    venv = as_vector(env)
     budget = Budget.of(config, agent.config.batch_size, agent.config.batch_length, action_repeat)
     if config.storage == "host":
         _check_host()
@@ -208,6 +209,39 @@ def fit_memory(
                 f"{free * budget.capacity // storage.host_bytes:,} steps"
             )
     return available, replay_bytes + storage.host_bytes
+
+
+def over_seeds(
+    loop: Loop,
+) -> tuple[Callable[[Array], LoopState], Callable[[LoopState, Array], tuple[LoopState, Report]]]:
+    """``init(keys [R])`` and ``chunk(state, steps)`` of R runs at once, for runs that are too small to fill a device.
+
+    State and report have a leading axis R, but for what is the same in all runs: the steps, the credit, and how full
+    replay is. So each run has its own parameters, environments and replay, and does what it would do alone. ``init``
+    raises ValueError where memory can't hold R replays.
+
+    Raises ValueError for a loop that keeps images on the host, which serve one run.
+    """
+    if loop.frames is not None:
+        raise ValueError("loop.storage: expected 'pixels' or 'states' for several seeds at once, got 'host'")
+    shapes = loop.state_shapes()
+    axes: Any = jax.tree.map(lambda _: 0, shapes)
+    axes = axes._replace(
+        counters=axes.counters._replace(vector_step=None, credit=None),
+        replay=replace(axes.replay, position=None, size=None),
+    )
+
+    def init(keys: Array) -> LoopState:
+        needed, available = len(keys) * loop.replay_bytes, int(ring.FREE_FRACTION * memory.available())
+        if needed > available:
+            fit = available // loop.replay_bytes
+            raise ValueError(
+                f"{len(keys)} replays take {memory.readable(needed)}, and {memory.readable(available)} are free for "
+                f"them; expected at most {fit} seeds, or a smaller loop.capacity"
+            )
+        return jax.vmap(loop.init, out_axes=axes)(keys)
+
+    return init, jax.jit(jax.vmap(loop.chunk, in_axes=(axes, None), out_axes=(axes, 0)), donate_argnums=0)
 
 
 def _check_host() -> None:

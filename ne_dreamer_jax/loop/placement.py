@@ -13,16 +13,10 @@ from ne_dreamer_jax.system import parallel
 
 def shardings(mesh: Mesh, shapes: LoopState) -> LoopState:
     """A sharding for every array: environments and replay are divided over the devices, the rest is whole on each."""
-    specs: Any = LoopState(
-        train=parallel.WHOLE,
-        env=parallel.SPLIT,
-        policy=parallel.SPLIT,  # type: ignore[arg-type]
-        replay=ring.partition(shapes.replay),
-        episodes=parallel.SPLIT,  # type: ignore[arg-type]
-        counters=parallel.WHOLE,  # type: ignore[arg-type]
-        key=parallel.WHOLE,  # type: ignore[arg-type]
-    )
-    return parallel.shardings(mesh, specs, shapes)
+    specs: dict[str, Any] = dict.fromkeys(LoopState._fields, parallel.WHOLE)
+    specs |= dict.fromkeys(("env", "policy", "episodes"), parallel.SPLIT)
+    specs["replay"] = ring.partition(shapes.replay)
+    return parallel.shardings(mesh, LoopState(**specs), shapes)
 
 
 def check_divisible(mesh: Mesh | None, num_envs: int, batch_size: int) -> int:

@@ -10,7 +10,6 @@ from jax.sharding import Mesh
 
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.runs import progress, run_directory, training
-from ne_dreamer_jax.runs.evaluation import own
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.system import compile_cache
 from ne_dreamer_jax.system.quiet import quiet
@@ -57,7 +56,7 @@ def train(
     """
     quiet()
     path = Path(logdir).expanduser()
-    config = own(config, env)
+    config = config if env is None else training.own(config)
     run_directory.check(path)
     run_directory.check_same(path, config)
     compile_cache.enable()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +14,7 @@ from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.config import OwnConfig
-from ne_dreamer_jax.envs.vector import VectorEnv, check_env, vectorize
+from ne_dreamer_jax.envs.vector import as_vector, check_env
 from ne_dreamer_jax.loop.play import Evaluation, make_play
 from ne_dreamer_jax.runs import checkpoint, pictures, run_directory, video
 from ne_dreamer_jax.runs.run_directory import RunDirectory
@@ -66,11 +65,6 @@ def load(run: str | Path, env: Any = None, prefer: Prefer = "best") -> Loaded:
     return Loaded(config, env, agent, restored.items["agent"], restored.checkpoint, tuple(restored.skipped))
 
 
-def vector_of(env: Any) -> VectorEnv:
-    """N environments at once of a single one; what is of that kind already stays as it is."""
-    return env if isinstance(env, VectorEnv) else vectorize(env)
-
-
 def evaluate(
     run: str | Path,
     env: Any = None,
@@ -96,7 +90,7 @@ def evaluate(
     """
     loaded = load(run, env, prefer)
     content = head(loaded, episodes, seed, echo)
-    venv = vector_of(loaded.env)
+    venv = as_vector(loaded.env)
     play = make_play(venv, loaded.agent, loaded.config.loop.eval_max_steps)
     files = RunDirectory(Path(run))
     for name, key in keys(seed).items():
@@ -160,19 +154,3 @@ def _video(
     write = lambda: video.write(evaluation.frames, files.video, fps=video.frame_rate(step_seconds))
     if pictures.attempt(write, files.video, echo):
         echo(f"{files.video} shows the first episode")
-
-
-def own(config: Config, env: Any) -> Config:
-    """The configuration of a run on an environment that is given as an object: it says so.
-
-    Each of its steps counts for one environment step, unless the configuration says otherwise in an `OwnConfig`.
-
-    Raises:
-      ValueError: what is given is no environment.
-    """
-    if env is None:
-        return config
-    check_env(env)
-    if isinstance(config.env, OwnConfig):
-        return config
-    return replace(config, env=OwnConfig())

@@ -26,7 +26,7 @@ from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
-from ne_dreamer_jax.envs.config import OwnConfig
+from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
 from ne_dreamer_jax.envs.vector import check_env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
@@ -57,6 +57,14 @@ class Run(NamedTuple):
         return Schedule.of(self.config, self.loop)
 
 
+def own(config: Config) -> Config:
+    """The configuration of a run on an environment that is given as an object: it says so.
+
+    Each of its steps counts for one environment step, unless the configuration says otherwise in an `OwnConfig`.
+    """
+    return config if isinstance(config.env, OwnConfig) else replace(config, env=OwnConfig())
+
+
 def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> Run:
     """Makes the environment, the agent and the loop of a configuration; allocates nothing.
 
@@ -69,8 +77,8 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
     """
     if env is None:
         env = env_configs.make(config.env)
-    elif not isinstance(config.env, OwnConfig):
-        config = replace(config, env=OwnConfig(action_repeat=config.env.action_repeat))
+    else:
+        config = own(config)
     check_env(env)
     agent = make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
@@ -96,7 +104,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
     """
     schedule = run.schedule
-    if parallel.is_main_process() and run.config.env == OwnConfig(action_repeat=run.config.env.action_repeat):
+    if parallel.is_main_process() and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
     state, lines = _start(run, files, start_key, echo)
@@ -331,7 +339,7 @@ def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
         lines.append(f"  {files.curve}: the learning curve")
     if files.video.exists():
         lines.append(f"  {files.video}: an episode of the policy")
-    if run.config.env == OwnConfig(action_repeat=run.config.env.action_repeat):  # no command can make it
+    if run.config.env.task == GIVEN:  # no command can make it
         lines.append(f"  ne_dreamer_jax.evaluate({str(files.path)!r}, env=...) in Python: more episodes")
     else:
         lines.append(f"  python -m ne_dreamer_jax evaluate {typed(files.path)}: more episodes")
