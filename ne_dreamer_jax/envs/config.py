@@ -71,6 +71,50 @@ class JaxConfig:
 
 
 @dataclass(frozen=True)
+class HostConfig:
+    """An environment of another library in worker processes, see `envs.host`."""
+
+    task: str = "gym:CartPole-v1"
+    obs: Literal["own", "pixels", "both"] = "own"
+    """What it observes itself, a picture of it, or both."""
+    action_repeat: Repeat = 1
+    """Environment steps for which each action is held; rewards are summed."""
+    image_size: ImageSize = 64
+    """Height and width of images, to which others are scaled."""
+    workers: Annotated[int, Range(1, 65_536)] | None = None
+    """Processes, at most one an environment; none: as many as there are processors."""
+    step_seconds: Annotated[float, Range(0.001, 1e6)] = 60.0
+    """What a step may take before its worker counts as hung."""
+    on_failure: Literal["restart", "stop"] = "restart"
+    """Whether the run goes on with a new worker in place of one that failed, or is saved and stopped."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+@dataclass(frozen=True)
+class DmControlConfig:
+    """A task of dm_control itself, with C MuJoCo's physics and OpenGL pictures, in worker processes."""
+
+    task: str = "dm_control:walker_walk"
+    obs: Literal["pixels", "vector", "both"] = "pixels"
+    """pixels, vector or both."""
+    action_repeat: Repeat = 2
+    """Environment steps for which each action is held; rewards are summed."""
+    image_size: ImageSize = 64
+    """Height and width of the frames."""
+    workers: Annotated[int, Range(1, 65_536)] | None = None
+    """As of `HostConfig`."""
+    step_seconds: Annotated[float, Range(0.001, 1e6)] = 60.0
+    """As of `HostConfig`."""
+    on_failure: Literal["restart", "stop"] = "restart"
+    """As of `HostConfig`."""
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+
+
+@dataclass(frozen=True)
 class OwnConfig:
     """An environment of one's own, which says itself how it is observed."""
 
@@ -83,10 +127,21 @@ class OwnConfig:
         ranges.check(self)
 
 
-EnvConfig = DmcConfig | RoomsConfig | JaxConfig | OwnConfig
+EnvConfig = DmcConfig | RoomsConfig | JaxConfig | HostConfig | DmControlConfig | OwnConfig
 """The settings that a configuration may choose from: which, the task's name decides."""
 
-_OF_FAMILY: dict[str | None, type] = {"dmc/": DmcConfig, "rooms/": RoomsConfig, "jax:": JaxConfig, None: OwnConfig}
+_OF_FAMILY: dict[str | None, type] = {
+    "dmc/": DmcConfig,
+    "rooms/": RoomsConfig,
+    "jax:": JaxConfig,
+    "gym:": HostConfig,
+    "dm_env:": HostConfig,
+    "memory_maze:": HostConfig,
+    "dm_control:": DmControlConfig,
+    None: OwnConfig,
+}
+_SAME_CONTROL = (DmcConfig, DmControlConfig)
+"""Families with the same tasks, whose settings mean the same."""
 
 
 def for_task(task: str, like: Any) -> Any:
@@ -97,9 +152,9 @@ def for_task(task: str, like: Any) -> Any:
     """
     registry.check(task)
     kind = _OF_FAMILY[registry.family_of(task)]
-    known = {field.name for field in fields(kind)} - {"task", "action_repeat"}
-    if isinstance(like, kind):
-        known.add("action_repeat")
+    known = {field.name for field in fields(kind)} - {"task", "action_repeat", "obs"}
+    if isinstance(like, kind) or (isinstance(like, _SAME_CONTROL) and kind in _SAME_CONTROL):
+        known |= {"action_repeat", "obs"}
     shared = {field.name: getattr(like, field.name) for field in fields(like) if field.name in known}
     return kind(**{**shared, "task": task})
 

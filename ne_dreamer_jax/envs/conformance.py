@@ -53,7 +53,7 @@ class _Report:
 
 
 def check(
-    env: Env,
+    env: Env | VectorEnv,
     key: Array,
     num_envs: int = 2,
     num_steps: int = 5,
@@ -71,7 +71,7 @@ def check(
 
 
 def findings(
-    env: Env,
+    env: Env | VectorEnv,
     key: Array,
     num_envs: int = 2,
     num_steps: int = 5,
@@ -83,7 +83,8 @@ def findings(
     First the shapes and dtypes of all functions, without running them; where those are at fault, nothing more.
 
     Args:
-      env: what ``envs.make`` or ``envs.base.from_core`` returns, or any other ``Env``.
+      env: what ``envs.make`` or ``envs.base.from_core`` returns, or any other ``Env``; or a ``VectorEnv``, of which
+        ``num_envs`` play ``2 * num_steps + beginning_steps`` steps, twice over.
       key: typed key [], for episodes and random actions.
       num_envs: how many run side by side under ``vmap``.
       num_steps: steps before a restart is forced, and after it.
@@ -94,9 +95,10 @@ def findings(
       ValueError: ``env`` is not an environment but what one might be made of.
     """
     check_env(env)
-    if isinstance(env, VectorEnv):
-        raise ValueError("env: expected a single environment, an envs.base.Env, got a VectorEnv")
     report = _Report()
+    if isinstance(env, VectorEnv):
+        _check_vector(env, report, key, num_envs, 2 * num_steps + beginning_steps, echo)
+        return list(report.found.values())
     echo("Looking at shapes and dtypes.")
     try:
         _check_types(env, report)
@@ -107,7 +109,7 @@ def findings(
     return list(report.found.values())
 
 
-def random_action(env: Env, key: Array, num_envs: int) -> Array:
+def random_action(env: Env | VectorEnv, key: Array, num_envs: int) -> Array:
     """Uniformly random actions, [num_envs, *action.shape]."""
     spec = env.spec.action
     if isinstance(spec, ContinuousAction):
@@ -118,13 +120,17 @@ def random_action(env: Env, key: Array, num_envs: int) -> Array:
 # Shapes and dtypes.
 
 
-def _check_types(env: Env, report: _Report) -> None:
+def _check_spec(env: Env | VectorEnv, report: _Report) -> None:
     for name, spec in env.spec.observation.items():
         image = len(spec.shape) == 3 and spec.dtype == jnp.uint8
         vector = len(spec.shape) <= 1 and spec.dtype == jnp.float32
         expected = "uint8[height,width,channels] or float32[size] or float32[]"
         got = f"{jnp.dtype(spec.dtype).name}{list(spec.shape)}"
         report.expect(image or vector, f"spec.observation[{name!r}]", "dtype", expected, got)
+
+
+def _check_types(env: Env, report: _Report) -> None:
+    _check_spec(env, report)
     key = jax.eval_shape(lambda: jax.random.key(0))
     action = jax.ShapeDtypeStruct(env.spec.action.shape, env.spec.action.dtype)
     state, timestep = jax.eval_shape(env.reset, key)
@@ -136,17 +142,22 @@ def _check_types(env: Env, report: _Report) -> None:
     _check_state_types(state, jax.eval_shape(env.prepare, key), report, "prepare")
 
 
-def _check_timestep_types(env: Env, timestep: TimeStep, report: _Report, function: str) -> None:
-    _check_observation_types(env, timestep.obs, report, function)
+def _check_timestep_types(
+    env: Env | VectorEnv, timestep: TimeStep, report: _Report, function: str, batch: tuple[int, ...] = ()
+) -> None:
+    _check_observation_types(env, timestep.obs, report, function, batch)
     for name, dtype in (("reward", "float32"), ("is_first", "bool"), ("is_last", "bool"), ("is_terminal", "bool")):
-        _expect_type(report, f"{function}: {name}", jax.ShapeDtypeStruct((), jnp.dtype(dtype)), getattr(timestep, name))
+        expected = jax.ShapeDtypeStruct(batch, jnp.dtype(dtype))
+        _expect_type(report, f"{function}: {name}", expected, getattr(timestep, name))
 
 
-def _check_observation_types(env: Env, obs: Mapping[str, Any], report: _Report, function: str) -> None:
+def _check_observation_types(
+    env: Env | VectorEnv, obs: Mapping[str, Any], report: _Report, function: str, batch: tuple[int, ...] = ()
+) -> None:
     wanted = env.spec.observation
     report.expect(set(obs) == set(wanted), f"{function}: obs", "key", f"names {sorted(wanted)}", f"{sorted(obs)}")
     for name in sorted(set(obs) & set(wanted)):
-        spec = jax.ShapeDtypeStruct(wanted[name].shape, jnp.dtype(wanted[name].dtype))
+        spec = jax.ShapeDtypeStruct((*batch, *wanted[name].shape), jnp.dtype(wanted[name].dtype))
         _expect_type(report, f"{function}: obs[{name!r}]", spec, obs[name])
 
 
@@ -224,6 +235,62 @@ def _check_episodes(
     for name, function in (("reset", reset), ("step", step)):
         times = _compilations(function)
         report.expect(times == 1, name, "compilation", "one compilation", f"{times}")
+
+
+def _check_vector(
+    env: VectorEnv, report: _Report, key: Array, num_envs: int, num_steps: int, echo: Callable[[str], None]
+) -> None:
+    """What can be asked of N environments that can't be stepped one by one, nor from the same state twice."""
+    echo("Looking at shapes and dtypes.")
+    _check_spec(env, report)
+    reset_key, action_key = jax.random.split(key)
+    keys = jax.random.split(reset_key, num_envs)
+    actions = [random_action(env, jax.random.fold_in(action_key, number), num_envs) for number in range(num_steps)]
+    state = jax.eval_shape(env.prepare, keys)
+    stepped, timestep = jax.eval_shape(env.step, state, actions[0])
+    _check_timestep_types(env, timestep, report, "step", (num_envs,))
+    _check_state_types(state, stepped, report, "step")
+    if report.found:
+        return
+
+    echo(f"Stepping {num_envs} environments {num_steps} times, and again from the same keys.")
+    step = jax.jit(env.step)
+    played = [_played(env, step, keys, actions, report) for _ in range(2)]
+    for number, (timestep, again) in enumerate(zip(*played, strict=True)):
+        report.same("step", again, timestep, f"{number} steps after prepare with the same keys")
+    if isinstance(env.spec.action, ContinuousAction) and not report.found:
+        sides = ([factor * jnp.sign(action) for action in actions[:5]] for factor in (1, 7))
+        at, beyond = (np.concatenate(_numbers(*_played(env, step, keys, side, report))) for side in sides)
+        expected = "an action out of bounds to act as the bound"
+        report.expect(np.array_equal(at, beyond), "action", "bound", expected, "another time step")
+    times = _compilations(step)
+    report.expect(times == 1, "step", "compilation", "one compilation", f"{times}")
+
+
+def _played(
+    env: VectorEnv, step: Callable[..., Any], keys: Array, actions: list[Array], report: _Report
+) -> list[TimeStep]:
+    """The time steps of episodes from the beginning, each looked at."""
+    state, last, timesteps = env.prepare(keys), np.ones(len(keys), bool), []
+    for number, action in enumerate(actions):
+        state, timestep = step(state, action)
+        when = f"step {number + 1}"
+        _check_values(timestep, report, when)
+        if number == 0:
+            _check_first(timestep, report, "the first step")
+        first = np.asarray(timestep.is_first)
+        expected = "True right after is_last and nowhere else"
+        report.expect(np.array_equal(first, last), "is_first", "flag", expected, f"{first} at {when}")
+        fresh = np.where(first, np.asarray(timestep.reward), 0.0)
+        report.expect(not fresh.any(), "reward", "bound", "0 where an episode starts", f"{fresh} at {when}")
+        last = np.asarray(timestep.is_last)
+        timesteps.append(timestep)
+    cuts = env.cuts(state)
+    failed = np.asarray(cuts.faults)
+    report.expect(not failed.any(), "episodes", "error", "none that the environment cut", f"{failed} of them")
+    if env.release is not None:
+        env.release(state)
+    return timesteps
 
 
 def _check_bounds(step: Callable[..., Any], state: EnvState, bound: Array, report: _Report) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ne_dreamer_jax.envs.dmc.names import NAMES as DMC_NAMES
+from ne_dreamer_jax.envs.host import names as host_names
 from ne_dreamer_jax.envs.rooms.names import NAMES as ROOMS_NAMES
 from ne_dreamer_jax.settings.text import did_you_mean
 
@@ -34,6 +35,7 @@ FAMILIES: dict[str, Family] = {
     "dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES),
     "rooms/": Family("ne_dreamer_jax.envs.rooms.tasks", lambda: ROOMS_NAMES),
     "jax:": Family("ne_dreamer_jax.envs.adapters", lambda: (), lambda name: _adapters().check_installed(name)),
+    **{prefix: Family("ne_dreamer_jax.envs.host", lambda: (), host_names.check) for prefix in host_names.LIBRARIES},
 }
 """Prefix -> family."""
 

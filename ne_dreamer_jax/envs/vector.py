@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 
@@ -21,8 +21,25 @@ class Cuts(NamedTuple):
     bad_actions: Array  # because an action was not finite
 
 
+class Host(Protocol):
+    """Environments that are stepped outside of the compiled program, in processes of their own."""
+
+    failure: str | None
+    """Why they were given up, where they were; the program's call has then raised."""
+    should_stop: bool
+    """Whether something failed that is to end a training run at the next opportunity."""
+
+    def lines(self) -> list[str]:
+        """What happened to them since this was last asked, a line each."""
+        ...
+
+    def close(self) -> None:
+        """Ends the processes."""
+        ...
+
+
 class VectorEnv(NamedTuple):
-    """Pure functions of N environments at once; N is that of the arguments."""
+    """Functions of N environments at once; N is that of the arguments. Pure, but for environments on the `Host`."""
 
     spec: EnvSpec
     """Of one environment."""
@@ -36,6 +53,12 @@ class VectorEnv(NamedTuple):
     """How images can be drawn again: ``record`` of states [N], ``redraw`` of one record."""
     step_seconds: float | None = None
     """Simulated time of an agent step, where the environment has such."""
+    start: Callable[[Any, Array], Any] | None = None
+    """(states, actions) -> states, to be stepped with these actions: where steps take place elsewhere, they begin."""
+    release: Callable[[Any], None] | None = None
+    """Of states that are stepped no more, where they hold anything; no part of a compiled program."""
+    host: Host | None = None
+    """Where the environments are, if they are not in the program."""
 
 
 def vectorize(env: Env) -> VectorEnv:

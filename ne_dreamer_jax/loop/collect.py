@@ -38,6 +38,8 @@ def collect(
     step_share = parallel.per_shard(env.step, (parallel.SPLIT, parallel.SPLIT), parallel.SPLIT)
     env_state, timestep = step_share(state.env, state.policy.prev_action)
     policy, action = agent.act(state.train.params, state.policy, timestep, key)
+    if env.start is not None:  # the environments take their step while the agent learns
+        env_state = env.start(env_state, action)
     obs = storage.encode_obs(env_state, timestep.obs, ring.next_row(state.replay))
     step = transition(time_limits, timestep._replace(obs=obs), policy, action)
     replay = ring.add(state.replay, step)

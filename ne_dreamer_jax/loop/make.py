@@ -77,6 +77,8 @@ def make(config: LoopConfig, env: Any, agent: Agent, action_repeat: int, mesh: M
     """
     devices = placement.check_divisible(mesh, config.num_envs, agent.config.batch_size)
     venv = as_vector(env)
+    if venv.host is not None and mesh is not None:
+        raise ValueError("expected one device for environments in worker processes; leave out --devices and a mesh")
     budget = Budget.of(config, agent.config.batch_size, agent.config.batch_length, action_repeat)
     if config.storage == "host":
         _check_host()
@@ -156,6 +158,9 @@ def chunk(
         done = state.counters.vector_step + 1
         credit = state.counters.credit + jnp.where(done > budget.prefill, budget.step_credit, 0)
         due = credit // budget.update_cost
+        if env.start is not None:  # learning begins when the environments' step has begun
+            due, env_state = jax.lax.optimization_barrier((due, state.env))
+            state = state._replace(env=env_state)
         train, replay, sums = learn_what_is_due(
             agent, storage, config.write_latents, due, state.train, state.replay, update_key, sums
         )

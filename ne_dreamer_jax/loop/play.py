@@ -23,7 +23,7 @@ class Evaluation(NamedTuple):
 
     returns: Array  # float32 [M]
     lengths: Array  # int32 [M], agent steps
-    complete: Array  # bool [M], False where the environment cut it: broken physics, or an action that was not finite
+    complete: Array  # bool [M], False where the environment cut it: by a fault of its own, or an action not finite
     frames: Any = None  # uint8 numpy [steps, H, W, C] of the first episode's first image, or None
     unfinished: int = 0  # episodes that had not ended at the bound
     steps: Any = None  # numpy: `Steps` of all episodes, where they were asked for
@@ -90,6 +90,8 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
                 seen.append(jax.device_get(kept))
             if bool(jnp.all(carry.done)):
                 break
+        if env.release is not None:
+            env.release(carry.env)
         return Evaluation(
             returns=carry.returns,
             lengths=carry.lengths,

@@ -89,7 +89,7 @@ class Pace:
         if values.get("train/bad_actions"):
             parts.append(f"episodes cut by actions that are not finite: {values['train/bad_actions']:.0f}")
         if values.get("train/faults"):
-            parts.append(f"episodes cut by broken physics: {values['train/faults']:.0f}")
+            parts.append(f"episodes cut by faults of the environment: {values['train/faults']:.0f}")
         parts.append(self._left(step))
         return "  ".join(parts)
 

@@ -27,7 +27,7 @@ from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
-from ne_dreamer_jax.envs.vector import check_env
+from ne_dreamer_jax.envs.vector import Host, VectorEnv, check_env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
@@ -50,6 +50,7 @@ class Run(NamedTuple):
     loop: Loop
     shapes: LoopState  # shapes and dtypes of the whole state
     step_seconds: float | None = None  # simulated time of an agent step
+    host: Host | None = None  # where the environments are, if they are not in the program
 
     @property
     def schedule(self) -> Schedule:
@@ -65,7 +66,7 @@ def own(config: Config) -> Config:
     return config if isinstance(config.env, OwnConfig) else replace(config, env=OwnConfig())
 
 
-def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> Run:
+def build(config: Config, env: Env | VectorEnv | None = None, mesh: Mesh | None = None) -> Run:
     """Makes the environment, the agent and the loop of a configuration; allocates nothing.
 
     Args:
@@ -82,11 +83,12 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
     check_env(env)
     agent = make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
-    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds)
+    host = env.host if isinstance(env, VectorEnv) else None
+    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds, host)
 
 
 def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
-    """Trains to the end of the budget, from the newest checkpoint if there is one.
+    """Trains to the end of the budget, from the newest checkpoint if there is one; ends the environments' processes.
 
     Where a run has several processes, all of them call this. The main process alone writes files, and decides what
     depends on a clock, a signal or a file.
@@ -98,11 +100,28 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
 
     Returns:
       The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, `DIVERGED` where
-      updates were not finite, `NOT_SAVED` where the last checkpoint could not be written.
+      updates were not finite, `NOT_SAVED` where the last checkpoint could not be written, `ENVIRONMENT` where
+      environments in worker processes failed.
 
     Raises:
       ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
     """
+    if run.host is None:
+        return _train(run, files, checkpoint_minutes, echo)
+    echo(NO_EXACT_RESUME)
+    try:
+        return _train(run, files, checkpoint_minutes, echo)
+    except jax.errors.JaxRuntimeError:
+        if run.host.failure is None:
+            raise
+        for line in [*run.host.lines(), f"Stopped: the environments failed: {run.host.failure}. {_last(files)}"]:
+            echo(line)
+        return ENVIRONMENT
+    finally:
+        run.host.close()
+
+
+def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo) -> int:
     schedule = run.schedule
     if parallel.is_main_process() and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
@@ -146,6 +165,12 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
             echo(pace.line(before, counters, values, seconds))
             if int(state.counters.skipped) >= run.config.loop.max_skipped:
                 return _diverged(run, files, report, state, echo)
+            for line in run.host.lines() if run.host is not None else ():
+                echo(line)
+            if run.host is not None and run.host.should_stop:
+                saves.whole(state, counters, record.score(counters))
+                echo(f"Stopped, as an environment failed (env.on_failure=stop). {_last(files)}")
+                return ENVIRONMENT
             if saves.due():
                 saves.whole(state, counters, record.score(counters))
         saves.whole(state, counters, record.score(counters))
@@ -201,7 +226,10 @@ def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo
     if not finite:
         echo("The agent has diverged: some of its parameters are not finite. It is not kept as the best.")
     elif cut:
-        echo(f"{cut} of the episodes were cut short by broken physics, so that this agent is not kept as the best.")
+        echo(
+            f"{cut} of the episodes were cut short by faults of the environment, so that this agent is not kept as the "
+            "best."
+        )
     return values, evaluation.frames
 
 
@@ -287,21 +315,30 @@ DIVERGED = 3
 """Exit code of a run that stopped because its updates were not finite."""
 NOT_SAVED = 4
 """Exit code of a run whose last checkpoint could not be written."""
+ENVIRONMENT = 5
+"""Exit code of a run whose environments, in processes of their own, failed."""
+NO_EXACT_RESUME = (
+    "The environments run in worker processes, which checkpoints do not hold: a run that is stopped and goes on begins "
+    "their episodes anew. All else resumes as it was."
+)
 
 
 def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, echo: Echo) -> int:
     """Says what happened and what can be done; the state, which no such update has changed, is not saved."""
     counted = {name.removeprefix(guard.PREFIX): value for name, value in report.learning.items()}
     guilty = sorted(name for name, value in counted.items() if f"{guard.PREFIX}{name}" in report.learning and value)
-    found = checkpoint.checkpoints(files.checkpoints)
-    last = f"The last checkpoint is {found[0].path}." if found else "There is no checkpoint yet."
     echo(
         f"Stopped: {int(state.counters.skipped):,} updates in a row were not finite (loop.max_skipped is "
-        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. {last} Try a "
-        "lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the size of the rewards, or set "
+        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. {_last(files)} "
+        "Try a lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the size of the rewards, or set "
         "JAX_DEBUG_NANS=True to find the first operation."
     )
     return DIVERGED
+
+
+def _last(files: RunDirectory) -> str:
+    found = checkpoint.checkpoints(files.checkpoints)
+    return f"The last checkpoint is {found[0].path}." if found else "There is no checkpoint yet."
 
 
 @jax.jit

@@ -73,7 +73,7 @@ def test_the_time_left_counts_chunks_that_learned_and_evaluations_to_come():
         "46 s left",  # 80 steps of 0.4 s and two evaluations
     ]
     third = pace.line(counters[2], counters[3], {"train/faults": 2.0}, seconds=4.0)
-    assert "episodes cut by broken physics: 2" in third.split("  ")
+    assert "episodes cut by faults of the environment: 2" in third.split("  ")
     assert "broken" not in pace.line(counters[2], counters[3], {"train/faults": 0.0}, seconds=4.0)
 
 

@@ -1,0 +1,75 @@
+"""What workers make their environments with, by name or by a factory."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from ne_dreamer_jax.envs.host import names
+from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options, Player
+
+
+@dataclass(frozen=True)
+class Made:
+    """A player of what a factory makes."""
+
+    player: Callable[[Any, Options], Player]
+    factory: Callable[[], Any]
+    options: Options
+
+    def __call__(self) -> Player:
+        return self.player(self.factory(), self.options)
+
+
+def _gymnasium(task: str, options: Options) -> Player:
+    import gymnasium
+
+    names.register_installed()
+    drawn = None if options.observe == "own" else "rgb_array"
+    return GymnasiumPlayer(gymnasium.make(task, render_mode=drawn), options)
+
+
+def _dm_env(task: str, options: Options) -> Player:
+    module, _, function = task.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), function, None)
+    except ImportError as error:
+        raise ValueError(f"dm_env:{task}: {error}; run the command where Python finds {module}") from error
+    if not callable(factory):
+        raise ValueError(f"dm_env:{task}: expected a function {function} in {module}")
+    return DmEnvPlayer(factory(), options)
+
+
+def _dm_control(task: str, options: Options) -> Player:
+    from absl import logging
+
+    logging.set_verbosity(logging.ERROR)  # some models are in an older style, and MuJoCo says so each time
+    from dm_control import suite
+
+    domain, name = next(((domain, name) for domain, name in suite.ALL_TASKS if f"{domain}_{name}" == task), ("", ""))
+    if not domain:
+        from ne_dreamer_jax.settings.text import did_you_mean
+
+        known = [f"{domain}_{name}" for domain, name in suite.ALL_TASKS]
+        raise ValueError(f"no task of dm_control is called {task!r}. {did_you_mean(task, known)}")
+    camera = _CAMERAS.get(domain, 0)
+    return DmEnvPlayer(suite.load(domain, name), options, camera)
+
+
+def _memory_maze(task: str, options: Options) -> Player:
+    from memory_maze import tasks
+
+    return DmEnvPlayer(getattr(tasks, f"memory_maze_{task}")(), options)
+
+
+_CAMERAS = {"quadruped": 2}
+"""Domain -> the camera of a pixel agent, where it is not the first."""
+PLAYERS: dict[str, Callable[[str, Options], Player]] = {
+    names.GYM: _gymnasium,
+    names.DM_ENV: _dm_env,
+    names.DM_CONTROL: _dm_control,
+    names.MEMORY_MAZE: _memory_maze,
+}
+"""Prefix -> what makes a player of the rest of a name."""

@@ -1,0 +1,376 @@
+"""The main process's side: worker processes, what is asked of them, and what becomes of those that fail."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ne_dreamer_jax.envs.host.players import Player
+from ne_dreamer_jax.envs.host.spaces import Described
+from ne_dreamer_jax.envs.host.worker import BEGIN, NOTHING, STEP, Failed, Make, Seed, Step, Stepped
+
+START_SECONDS = 600.0
+"""What a worker may take to load its libraries and make its environments."""
+FAILURES = 5
+"""Of an environment, without an episode that ended or `STEPS` steps in between, after which it is given up."""
+STEPS = 1_000
+VARIABLE = "NE_DREAMER_WORKER"
+"""Environment variable of workers that holds their number in their pool, from 0."""
+_MAIN = "from ne_dreamer_jax.envs.host.worker import main; main()"
+_LINES = 20
+"""At most so many are kept of what happens in a chunk."""
+
+
+class HostEnvError(RuntimeError):
+    """An environment can't be made, or fails again and again."""
+
+
+class Workers(NamedTuple):
+    """How environments are spread over processes, and what their failures lead to."""
+
+    processes: int | None = None
+    """At most one an environment; None: as many as this process has processors."""
+    step_seconds: float = 60.0
+    """What a step or the beginning of an episode may take before its worker counts as hung."""
+    on_failure: Literal["restart", "stop"] = "restart"
+    """Whether training goes on with a new worker or environment, or is saved and stopped."""
+
+
+class Lost(NamedTuple):
+    """The answer in place of an environment whose worker is gone or failed: its episode is cut where it was."""
+
+    why: str
+
+
+class Worker:
+    """One process with some environments."""
+
+    def __init__(self, factory: bytes, count: int, number: int) -> None:
+        """Starts it, and asks for its environments; `described` waits for them.
+
+        Args:
+          factory: of players, as cloudpickle stores it.
+        """
+        self.number, self.count = number, count
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-c", _MAIN, str(theirs.fileno())]
+        # A session of its own: Ctrl-C in a terminal reaches the main process alone, which then ends the workers.
+        self.process = subprocess.Popen(
+            command,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            env={
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path),
+                VARIABLE: str(number),
+            },
+        )
+        theirs.close()
+        self.connection = Connection(ours.detach())
+        self.send(Make(_Pickled(factory), count))
+
+    def send(self, message: Any) -> None:
+        """Sends, or leaves it to `receive` to find that nobody is there."""
+        with contextlib.suppress(OSError):
+            self.connection.send(message)
+
+    def receive(self, seconds: float, deadline: float | None = None) -> Any:
+        """The answer to the last question, or `Lost` where there is none in time.
+
+        Args:
+          seconds: what an answer may take.
+          deadline: of the monotonic clock, where the question was asked a while ago.
+        """
+        try:
+            if self.connection.poll(seconds if deadline is None else max(0.0, deadline - time.monotonic())):
+                return self.connection.recv()
+            return Lost(f"worker {self.number} did not answer for {seconds:g} s")
+        except (EOFError, OSError):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(5.0)
+            return Lost(f"worker {self.number} {_ended(self.process.returncode)}")
+
+    def close(self, seconds: float = 5.0) -> None:
+        """Asks it to end, and ends it where it does not."""
+        self.connection.close()
+        try:
+            self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+
+class _Pickled:
+    """A factory that is unpickled where it is called, so that what it needs loads in the worker."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+
+    def __call__(self) -> Player:
+        import cloudpickle
+
+        return cloudpickle.loads(self._content)()
+
+
+class Pool:
+    """N environments in worker processes, stepped together."""
+
+    def __init__(self, factory: bytes, n: int, workers: Workers, report: Callable[[str], None]) -> None:
+        """Starts the workers.
+
+        Args:
+          factory: of players, as cloudpickle stores it.
+          report: takes a line on each failure.
+
+        Raises:
+          HostEnvError: an environment can't be made.
+        """
+        self.n, self._factory, self._options, self._report = n, factory, workers, report
+        count = min(n, workers.processes or processors())
+        bounds = np.linspace(0, n, count + 1).astype(int)
+        self._shares = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
+        self._failures = np.zeros(n, int)
+        self._steps = np.zeros(n, int)  # since the last failure
+        self._gone = np.zeros(n, bool)  # what became of the episode with its worker, and is still to be told
+        self._restarts = np.zeros(n, int)
+        self._seeds = np.zeros(n, np.uint64)
+        self.started: int | None = None
+        """The number of the step that workers were last asked for."""
+        self._workers = [self._start(i) for i in range(count)]
+        for worker in self._workers:
+            self.described = self._described(worker)
+
+    def seed(self, seeds: Sequence[int]) -> None:
+        """Seeds the next beginnings of all environments."""
+        self._seeds = np.array([seed % 2**63 for seed in seeds], np.uint64)
+        self._restarts[:] = 0
+        for worker, share in zip(self._workers, self._shares, strict=True):
+            worker.send(Seed([_seed(seed, 0) for seed in self._seeds[share]]))
+
+    def start(self, number: int, actions: np.ndarray, restart: np.ndarray) -> None:
+        """Asks for step ``number``, if that has not been done; environments to ``restart`` begin an episode instead."""
+        if self.started == number:
+            return
+        self.started = number
+        what = np.where(restart, BEGIN, np.where(self._gone, NOTHING, STEP)).astype(np.int8)
+        self._gone[:] = False
+        for worker, share in zip(self._workers, self._shares, strict=True):
+            worker.send(Step(actions[share], what[share]))
+
+    def finish(self, actions: np.ndarray, restart: np.ndarray) -> list[Stepped | Lost]:
+        """Waits for the step that was asked for; workers that are gone or hang are replaced, and named.
+
+        Returns:
+          An answer for each environment; never `Lost` where it was to ``restart``.
+
+        Raises:
+          HostEnvError: an environment fails again and again.
+        """
+        deadline = time.monotonic() + self._options.step_seconds
+        answers: list[Any] = []
+        for i, share in enumerate(self._shares):
+            answer = self._workers[i].receive(self._options.step_seconds, deadline)
+            if isinstance(answer, Lost):
+                self._replace(i, answer)
+                answer = [answer] * (share.stop - share.start)
+            answers += answer
+        for i, first in enumerate(restart):
+            answers[i] = self._counted(i, answers[i])
+            while first and isinstance(answers[i], Lost):  # what has not begun can't be cut
+                answers[i] = self._counted(i, self._begin(i, actions))
+            self._note(i, answers[i])
+        return answers
+
+    def close(self) -> None:
+        """Ends all workers."""
+        workers, self._workers = self._workers, []
+        for worker in workers:
+            worker.connection.close()  # all of them, before any is waited for
+        for worker in workers:
+            worker.close()
+
+    def _start(self, number: int) -> Worker:
+        share = self._shares[number]
+        return Worker(self._factory, share.stop - share.start, number)
+
+    def _described(self, worker: Worker) -> Described:
+        answer = worker.receive(START_SECONDS)
+        if isinstance(answer, Described):
+            return answer
+        self.close()
+        raise HostEnvError(answer.error if isinstance(answer, Failed) else answer.why)
+
+    def _replace(self, i: int, lost: Lost) -> None:
+        """Starts a worker in place of one that is gone."""
+        self._report(f"{lost.why}; it is started anew, and its episodes are cut.")
+        share = self._shares[i]
+        self._workers[i].close(0.0)
+        self._workers[i] = self._start(i)
+        self._described(self._workers[i])
+        self._restarts[share] += 1
+        self._gone[share] = True
+        seeds = [_seed(seed, number) for seed, number in zip(self._seeds[share], self._restarts[share], strict=True)]
+        self._workers[i].send(Seed(seeds))
+
+    def _counted(self, i: int, answer: Stepped | Failed | Lost | None) -> Stepped | Lost:
+        """Reports and counts what an environment failed at."""
+        if answer is None:
+            return Lost("its worker was started anew")
+        if isinstance(answer, Stepped):
+            if answer.fault:
+                self._report(f"environment {i}: {answer.fault}; its episode is cut.")
+            return answer
+        why = answer.why if isinstance(answer, Lost) else f"environment {i} raised {answer.error}"
+        self._failures[i] += 1
+        if self._failures[i] > FAILURES:
+            raise HostEnvError(f"{why}; {FAILURES} failures came before it, without an episode that ended in between")
+        if isinstance(answer, Failed):
+            self._report(f"{why}; it is made anew, and its episode is cut.")
+        return Lost(why)
+
+    def _note(self, i: int, answer: Stepped | Lost) -> None:
+        """Counts steps without a failure, after so many of which, or an episode's end, failures are forgotten."""
+        fine = isinstance(answer, Stepped) and not answer.fault
+        self._steps[i] = self._steps[i] + 1 if fine else 0
+        if isinstance(answer, Stepped) and fine and (answer.is_last or self._steps[i] >= STEPS):
+            self._failures[i] = 0
+
+    def _begin(self, i: int, actions: np.ndarray) -> Stepped | Failed | Lost:
+        """Asks again for the first step of one environment's episode."""
+        j = next(j for j, share in enumerate(self._shares) if share.start <= i < share.stop)
+        share = self._shares[j]
+        what = np.full(share.stop - share.start, NOTHING, np.int8)
+        what[i - share.start] = BEGIN
+        self._workers[j].send(Step(actions[share], what))
+        answer = self._workers[j].receive(self._options.step_seconds)
+        if isinstance(answer, Lost):
+            self._replace(j, answer)
+            return answer
+        self._gone[i] = False
+        return answer[i - share.start]
+
+
+class Pools:
+    """All pools of one kind of environment: the training's, and those of evaluations, which are used again.
+
+    Pools are known by a number that no other process gives to one of its own, so that a state of the environments
+    that was stored by another process is recognised as such.
+    """
+
+    def __init__(self, factory: Callable[[], Player], workers: Workers | None = None) -> None:
+        """Starts one worker, to see what the environments are like.
+
+        Args:
+          factory: makes one; pickled by value where it stands in a script or notebook.
+
+        Raises:
+          HostEnvError: the environment can't be made, or an agent can't see it or act in it; the message says why.
+        """
+        try:
+            import cloudpickle
+        except ImportError as error:
+            raise HostEnvError(
+                "environments in worker processes need the package cloudpickle; install it with: pip install "
+                "'ne-dreamer-jax[host]'"
+            ) from error
+        self.workers = workers or Workers()
+        self._factory = cloudpickle.dumps(factory)
+        self._lock = threading.RLock()
+        self._pools: dict[int, Pool] = {}
+        self._idle: list[Pool] = []
+        self._lines: list[str] = []
+        self.failure: str | None = None
+        """Why environments were given up, where they were."""
+        self.should_stop = False
+        """Whether something failed and that is to end the run."""
+        self._looked_at = self._make(1)
+        self.described = self._looked_at.described
+        self._idle.append(self._looked_at)
+
+    def open(self, seeds: Sequence[int]) -> int:
+        """The number of a pool with as many environments, of which the next steps begin seeded episodes."""
+        with self._lock:
+            n = len(seeds)
+            fitting = next((pool for pool in self._idle if pool.n == n), None)
+            if fitting is None:
+                pool = self._make(n)
+                if self._looked_at in self._idle:  # it has served its purpose
+                    self._idle.remove(self._looked_at)
+                    self._looked_at.close()
+            else:
+                pool = fitting
+                self._idle.remove(pool)
+            pool.seed(seeds)
+            pool.started = None
+            number = int.from_bytes(os.urandom(4), "little") >> 1
+            self._pools[number] = pool
+            return number
+
+    def get(self, number: int) -> Pool | None:
+        """The pool of this number; None for one of another process."""
+        return self._pools.get(number)
+
+    def release(self, number: int) -> None:
+        """Gives a pool back, whose workers wait for the next `open` of as many environments."""
+        with self._lock:
+            pool = self._pools.pop(number, None)
+            if pool is not None:
+                self._idle.append(pool)
+
+    def lines(self) -> list[str]:
+        """What happened since this was last asked."""
+        lines, self._lines = self._lines, []
+        return lines
+
+    def report(self, line: str) -> None:
+        """Takes a line on something that happened, of which few are kept when there are very many."""
+        if len(self._lines) < _LINES:
+            self._lines.append(line)
+
+    def failed(self, line: str) -> None:
+        """Takes a line on a failure."""
+        self.report(line)
+        self.should_stop = self.workers.on_failure == "stop"
+
+    def close(self) -> None:
+        """Ends all workers."""
+        with self._lock:
+            pools = [*self._pools.values(), *self._idle]
+            self._pools, self._idle = {}, []
+        for pool in pools:
+            pool.close()
+
+    def _make(self, n: int) -> Pool:
+        return Pool(self._factory, n, self.workers, self.failed)
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _seed(seed: Any, restarts: Any) -> int:
+    """Of an environment in a worker that was started for the so-manieth time: 31 bits, as libraries take them."""
+    return int(np.random.SeedSequence([int(seed), int(restarts)]).generate_state(1)[0] >> 1)
+
+
+def _ended(code: int | None) -> str:
+    if code is None:
+        return "closed its connection"
+    if code < 0:
+        return f"was ended by signal {-code} ({signal.Signals(-code).name})"
+    return f"ended with exit code {code}"

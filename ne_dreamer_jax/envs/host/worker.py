@@ -1,0 +1,177 @@
+"""A worker process: some environments of one kind, stepped one after the other when the main process asks.
+
+`pool` starts it with `main`, which takes the file descriptor of a connection as its argument. It ends when the main
+process closes the connection or is gone, however that ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ne_dreamer_jax.envs.host.players import Player
+
+STEP, BEGIN, NOTHING = 0, 1, 2
+"""Whether an environment takes its action, begins an episode, or is left alone."""
+
+
+class Make(NamedTuple):
+    """Asks for as many environments; answered by what the first is like."""
+
+    factory: Callable[[], Player]
+    number: int
+
+
+class Seed(NamedTuple):
+    """Seeds the next beginning of each environment; not answered."""
+
+    seeds: list[int]
+
+
+class Step(NamedTuple):
+    """Asks for a step of all environments; answered by a list of `Stepped`, `Failed` or, where left alone, None."""
+
+    actions: Any  # [n, ...]
+    what: Any  # int8 [n], of `STEP`, `BEGIN`, `NOTHING`
+
+
+class Stepped(NamedTuple):
+    """An environment's answer."""
+
+    obs: dict[str, np.ndarray]
+    reward: float
+    is_last: bool
+    is_terminal: bool
+    fault: str = ""  # why the episode is cut here, where it is
+
+
+class Failed(NamedTuple):
+    """What an environment raised; it is made anew."""
+
+    error: str
+
+
+class Envs:
+    """The environments of a worker."""
+
+    def __init__(self, factory: Callable[[], Player], count: int) -> None:
+        self._factory = factory
+        self._players: list[Player | None] = [factory() for _ in range(count)]
+        self._seeds: list[int | None] = [None] * count
+
+    @property
+    def described(self) -> Any:
+        """What the first is like."""
+        player = self._players[0]
+        assert player is not None
+        return player.described
+
+    def seed(self, seeds: list[int]) -> None:
+        """Seeds the next beginnings."""
+        self._seeds = list(seeds)
+
+    def step(self, number: int, action: np.ndarray, what: int) -> Stepped | Failed | None:
+        """A step of one environment; what it raises is told, and the environment made anew at its next beginning."""
+        if what == NOTHING:
+            return None
+        try:
+            player = self._players[number]
+            if player is None:
+                player = self._players[number] = self._factory()
+            if what == BEGIN:
+                seed, self._seeds[number] = self._seeds[number], None
+                return checked(Stepped(player.reset(seed), 0.0, False, False))
+            return checked(Stepped(*player.step(action)))
+        except Exception as error:
+            self._drop(number)
+            return Failed(summary(error))
+
+    def close(self) -> None:
+        """Closes all."""
+        for number in range(len(self._players)):
+            self._drop(number)
+
+    def _drop(self, number: int) -> None:
+        player, self._players[number] = self._players[number], None
+        if player is not None:
+            with contextlib.suppress(Exception):  # it is broken already, or nobody is left to hear of it
+                player.close()
+
+
+def checked(stepped: Stepped) -> Stepped:
+    """The same where all numbers are finite; else the episode's end, with zeros in place of what is not."""
+    names = [f"obs[{name!r}]" for name, x in stepped.obs.items() if x.dtype == np.float32 and not np.isfinite(x).all()]
+    names += ["the reward"] if not np.isfinite(np.float32(stepped.reward)) else []
+    if not names:
+        return stepped
+    obs = {
+        name: np.where(np.isfinite(x), x, np.float32(0)) if x.dtype == np.float32 else x
+        for name, x in stepped.obs.items()
+    }
+    return Stepped(obs, 0.0, True, False, f"{', '.join(names)} is not finite")
+
+
+def summary(error: BaseException) -> str:
+    """Kind and text of an error, and where it was raised, in one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:500]}{where}"
+
+
+def serve(connection: Connection) -> None:
+    """Answers until the connection is closed."""
+    envs: Envs | None = None
+    while True:
+        try:
+            message = connection.recv()
+        except (EOFError, OSError):
+            break
+        answer: Any = None
+        if isinstance(message, Make):
+            try:
+                envs = Envs(message.factory, message.number)
+                answer = envs.described
+            except Exception as error:
+                answer = Failed(summary(error) if not isinstance(error, ValueError) else str(error))
+        elif envs is None:
+            raise AssertionError(f"expected Make first, got {message}")
+        elif isinstance(message, Seed):
+            envs.seed(message.seeds)
+            continue
+        elif isinstance(message, Step):
+            answer = [envs.step(i, a, int(w)) for i, (a, w) in enumerate(zip(*message, strict=True))]
+        try:
+            connection.send(answer)
+        except OSError:
+            break
+    if envs is not None:
+        envs.close()
+
+
+def end_with(parent: int, seconds: float = 1.0) -> None:
+    """Ends this process when its parent is gone, also while an environment hangs."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(seconds)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main() -> None:
+    """Serves the connection whose file descriptor is the argument."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to answer
+    end_with(os.getppid())
+    sys.stdout = sys.stderr  # what environments print is no output of the run
+    serve(Connection(int(sys.argv[1])))
