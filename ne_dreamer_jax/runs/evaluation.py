@@ -14,7 +14,7 @@ from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.config import OwnConfig
-from ne_dreamer_jax.envs.vector import as_vector, check_env
+from ne_dreamer_jax.envs.vector import VectorEnv, as_vector, check_env
 from ne_dreamer_jax.loop.play import Evaluation, make_play
 from ne_dreamer_jax.runs import checkpoint, pictures, run_directory, video
 from ne_dreamer_jax.runs.run_directory import RunDirectory
@@ -73,6 +73,7 @@ def evaluate(
     prefer: Prefer = "best",
     seed: int = 0,
     with_video: bool = False,
+    also: str | None = None,
     echo: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Plays episodes with the policy of a run, beside a random policy's, and stores what came out.
@@ -82,13 +83,19 @@ def evaluate(
       episodes: M, played together.
       seed: of the episodes' beginnings.
       with_video: whether to write the first episode to ``policy.mp4``.
+      also: name of an environment to play as many episodes in, too: another with the same observations and actions.
       echo: takes the lines for people.
 
     Returns:
       What ``evaluation.json`` holds: ``task``, ``env_step``, ``episodes``, ``seed``, and for ``policy`` and ``random``
-      the ``mean``, ``std``, ``returns`` and ``lengths``, and the number ``unfinished`` at ``loop.eval_max_steps``.
+      the ``mean``, ``std``, ``returns`` and ``lengths``, and the number ``unfinished`` at ``loop.eval_max_steps``;
+      ``also`` holds the same of the other environment.
+
+    Raises:
+      ValueError: as `load`; or the other environment is observed or acted in otherwise.
     """
     loaded = load(run, env, prefer)
+    other = None if also is None else _other(also, loaded)
     content = head(loaded, episodes, seed, echo)
     venv = as_vector(loaded.env)
     play = make_play(venv, loaded.agent, loaded.config.loop.eval_max_steps)
@@ -99,7 +106,33 @@ def evaluate(
         echo(line(name, evaluation))
         if with_video and name == "policy":
             _video(evaluation, files, venv.step_seconds, echo)
+    if also is not None and other is not None:
+        content["also"] = {"task": also} | _play_also(also, other, loaded, episodes, seed, echo)
     run_directory.write_evaluation(files, content)
+    for used in (venv, other):
+        if used is not None and used.host is not None:
+            used.host.close()
+    return content
+
+
+def _other(task: str, loaded: Loaded) -> VectorEnv:
+    """The environment of this name, with the run's settings where it has such. Raises ValueError as `evaluate`."""
+    env = as_vector(env_configs.make(env_configs.for_task(task, loaded.config.env)))
+    for what, expected, got in zip(("observations", "actions"), loaded.agent.spec, env.spec, strict=True):
+        if expected != got:
+            raise ValueError(f"{task}: expected the {what} of {loaded.config.env.task}, {expected}, got {got}")
+    return env
+
+
+def _play_also(
+    task: str, env: VectorEnv, loaded: Loaded, episodes: int, seed: int, echo: Callable[[str], None]
+) -> dict[str, Any]:
+    play = make_play(env, loaded.agent, loaded.config.loop.eval_max_steps)
+    content = {}
+    for name, key in keys(seed).items():
+        evaluation = play(loaded.state.params, key, episodes, random=name == "random")
+        content[name] = summary(evaluation)
+        echo(line(name, evaluation, f" in {task}"))
     return content
 
 

@@ -44,7 +44,7 @@ def test_numbers_of_any_dtype_become_float32_vectors():
         name, value = seen(space, np.ones((2, 3), dtype))
         assert name == "vector"
         np.testing.assert_array_equal(value, np.ones(6, np.float32))
-    assert seen(gymnasium.spaces.Box(0, 1, (), np.float32), np.float32(0.5))[1].tolist() == [0.5]
+    assert seen(gymnasium.spaces.Box(0, 1, (), np.float32), np.float32(0.5))[1].tolist() == 0.5
     assert seen(gymnasium.spaces.MultiBinary(3), np.array([1, 0, 1], np.int8))[1].tolist() == [1, 0, 1]
 
 
@@ -152,7 +152,7 @@ def test_dm_env_ends_are_terminal_where_the_discount_is_zero():
         assert player.step(np.array([0.5])).reward == 6.0
         end = player.step(np.array([7.0]))
         assert (end.reward, end.is_last, end.is_terminal) == (6.0, True, discount == 0.0)
-        np.testing.assert_array_equal(end.obs["t"], [6.0])
+        np.testing.assert_array_equal(end.obs["t"], 6.0)
 
 
 # N environments.

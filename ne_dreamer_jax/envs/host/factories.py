@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ne_dreamer_jax.envs.host import names
+from ne_dreamer_jax.envs.host import names, opengl
 from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options, Player
 
 
@@ -45,6 +45,7 @@ def _dm_env(task: str, options: Options) -> Player:
 def _dm_control(task: str, options: Options) -> Player:
     from absl import logging
 
+    opengl.allow()
     logging.set_verbosity(logging.ERROR)  # some models are in an older style, and MuJoCo says so each time
     from dm_control import suite
 
@@ -54,11 +55,17 @@ def _dm_control(task: str, options: Options) -> Player:
 
         known = [f"{domain}_{name}" for domain, name in suite.ALL_TASKS]
         raise ValueError(f"no task of dm_control is called {task!r}. {did_you_mean(task, known)}")
-    camera = _CAMERAS.get(domain, 0)
-    return DmEnvPlayer(suite.load(domain, name), options, camera)
+    env, camera = suite.load(domain, name), _CAMERAS.get(domain, 0)
+    if options.observe != "own":
+        try:
+            env.physics.render(8, 8, camera_id=camera)
+        except Exception as error:
+            raise opengl.missing(error) from error
+    return DmEnvPlayer(env, options, camera)
 
 
 def _memory_maze(task: str, options: Options) -> Player:
+    opengl.allow()
     from memory_maze import tasks
 
     return DmEnvPlayer(getattr(tasks, f"memory_maze_{task}")(), options)

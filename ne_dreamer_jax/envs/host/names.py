@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import os
 from typing import NamedTuple
+
+from ne_dreamer_jax.envs.host import opengl
 
 GYM, DM_ENV, DM_CONTROL, MEMORY_MAZE = "gym:", "dm_env:", "dm_control:", "memory_maze:"
 MAZES = ("9x9", "11x11", "13x13", "15x15")
@@ -82,6 +86,7 @@ def _check_module(name: str, module: str) -> None:
 
 
 def _check_dm_control(name: str, task: str) -> None:
+    opengl.check(os.environ.get("MUJOCO_GL", ""))
     from ne_dreamer_jax.envs.dmc.names import NAMES
     from ne_dreamer_jax.settings.text import did_you_mean
 

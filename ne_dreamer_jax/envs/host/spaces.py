@@ -52,7 +52,7 @@ def observation(name: str, space: Any, image_size: int | None) -> tuple[str, tup
     """The name, shape and dtype of a part of the observation as an agent sees it, and what makes it of a value.
 
     Images (uint8 of rank 3, or of rank 2 without channels) become ``[image_size, image_size, C]``; all else becomes a
-    float32 vector: numbers flattened, choices as one-hot vectors.
+    float32 vector, a single number one without axes: numbers flattened, choices as one-hot vectors.
 
     Raises:
       ValueError: an observation that no encoder takes; the message says what to make of it.
@@ -138,13 +138,14 @@ def action(space: Any) -> tuple[int, bool, Callable[[np.ndarray], Any]]:
 
 
 def _vector(name: str, shape: tuple[int, ...]) -> tuple[str, tuple[int, ...], str, Reader]:
-    size = int(np.prod(shape, dtype=np.int64))
+    flattened = (int(np.prod(shape, dtype=np.int64)),) if shape else ()
 
     def read(value: Any) -> np.ndarray:
         with np.errstate(over="ignore"):  # what is too large for float32 is infinite, and reported as such
-            return np.asarray(value).astype(np.float32).reshape(-1)
+            vector = np.asarray(value).astype(np.float32)
+        return vector.reshape(-1) if shape or vector.size != 1 else vector.reshape(())
 
-    return name or "vector", (size,), "float32", read
+    return name or "vector", flattened, "float32", read
 
 
 def _choices(name: str, sizes: np.ndarray, where: str, start: int = 0) -> tuple[str, tuple[int, ...], str, Reader]:
