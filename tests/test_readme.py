@@ -43,6 +43,19 @@ def blocks(heading):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
+def test_the_readmes_gymnasium_environment_is_trained_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny = toy.config()
+    monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
+    monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
+    (code,) = blocks("### Environments of gymnasium and dm_env")
+    made = {"jax": jax}
+    exec(compile(code, "README.md", "exec"), made)
+    made["env"].host.close()
+    assert made["env"].spec.observation["vector"].shape == (3,)
+    assert (tmp_path / "runs" / "pendulum" / "curve.png").exists()
+
+
 def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
     """Its code runs as it stands, trained with a tiny agent in place of a preset's."""
     monkeypatch.chdir(tmp_path)

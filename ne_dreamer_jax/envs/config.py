@@ -136,6 +136,7 @@ _OF_FAMILY: dict[str | None, type] = {
     "jax:": JaxConfig,
     "gym:": HostConfig,
     "dm_env:": HostConfig,
+    "dmlab:": HostConfig,
     "memory_maze:": HostConfig,
     "dm_control:": DmControlConfig,
     None: OwnConfig,

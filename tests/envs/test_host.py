@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -19,7 +20,7 @@ import pytest
 
 from ne_dreamer_jax import envs
 from ne_dreamer_jax.envs import conformance
-from ne_dreamer_jax.envs.host import Options, Workers, from_dm_env, from_gymnasium, players, pool, spaces
+from ne_dreamer_jax.envs.host import Options, Workers, dmlab, from_dm_env, from_gymnasium, players, pool, spaces
 from ne_dreamer_jax.envs.vector import VectorEnv
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, DiscreteAction, TimeStep
 from tests.envs import host_fakes
@@ -153,6 +154,43 @@ def test_dm_env_ends_are_terminal_where_the_discount_is_zero():
         end = player.step(np.array([7.0]))
         assert (end.reward, end.is_last, end.is_terminal) == (6.0, True, discount == 0.0)
         np.testing.assert_array_equal(end.obs["t"], 6.0)
+
+
+class Lab:
+    """A stand-in for deepmind_lab's, with its interface."""
+
+    def __init__(self, level: str, observations: list[str], config: dict[str, str], renderer: str) -> None:
+        assert (level, observations, renderer) == ("contributed/dmlab30/rooms_x", ["RGB_INTERLEAVED"], "software")
+        self.size, self.frames, self.seed = int(config["width"]), 0, None
+
+    def reset(self, seed: int | None = None) -> None:
+        self.frames, self.seed = 0, seed
+
+    def is_running(self) -> bool:
+        return self.frames < 10
+
+    def observations(self) -> dict[str, np.ndarray]:
+        assert self.is_running()  # as the real one demands
+        return {"RGB_INTERLEAVED": np.full((self.size, self.size, 3), self.frames, np.uint8)}
+
+    def step(self, action: np.ndarray, num_steps: int) -> float:
+        assert (action.shape, action.dtype) == ((7,), np.intc)
+        self.frames += num_steps
+        return float(action[3])
+
+
+def test_dmlab_is_stepped_by_its_own_interface(monkeypatch):
+    monkeypatch.setitem(sys.modules, "deepmind_lab", SimpleNamespace(Lab=Lab))
+    player = dmlab.LabPlayer("rooms_x", Options(image_size=16, action_repeat=4))
+    assert player.described.observations == {"image": ((16, 16, 3), "uint8")}
+    assert player.described.actions == 9
+    assert player.reset(3)["image"].max() == 0
+    forward, back = player.step(np.int32(0)), player.step(np.int32(1))
+    assert (forward.reward, forward.obs["image"].max(), forward.is_last) == (1.0, 4, False)
+    assert (back.reward, back.obs["image"].max(), back.is_last) == (-1.0, 8, False)
+    end = player.step(np.int32(8))
+    assert (end.obs["image"].max(), end.is_last, end.is_terminal) == (8, True, False)
+    assert player.reset(None)["image"].max() == 0
 
 
 # N environments.
@@ -437,6 +475,7 @@ def test_workers_end_when_the_main_process_is_killed(tmp_path, how):
         ("dm_env:module", "expected dm_env:module:function"),
         ("dm_env:no such:make", "expected the name of a module"),
         ("dm_control:walkerwalk", "Did you mean walker_walk"),
+        ("dmlab:rooms_watermaze", "need the package deepmind_lab, which is not installed; install it with: its own"),
         ("memory_maze:9x9", "needs? the package memory_maze, which is not installed; install it with: pip install"),
     ],
 )

@@ -13,7 +13,7 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["factories", "names", "opengl", "players", "pool", "spaces", "tasks", "vector", "worker"],
+    submodules=["dmlab", "factories", "names", "opengl", "players", "pool", "spaces", "tasks", "vector", "worker"],
     submod_attrs={
         "players": ["Options"],
         "pool": ["Workers"],

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ne_dreamer_jax.envs.host import names, opengl
+from ne_dreamer_jax.envs.host.dmlab import LabPlayer
 from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options, Player
 
 
@@ -64,6 +65,12 @@ def _dm_control(task: str, options: Options) -> Player:
     return DmEnvPlayer(env, options, camera)
 
 
+def _dmlab(task: str, options: Options) -> Player:
+    if options.observe != "own":
+        raise ValueError(f"obs: expected 'own' for DMLab, which shows pictures, got {options.observe!r}")
+    return LabPlayer(task, options)
+
+
 def _memory_maze(task: str, options: Options) -> Player:
     opengl.allow()
     from memory_maze import tasks
@@ -77,6 +84,7 @@ PLAYERS: dict[str, Callable[[str, Options], Player]] = {
     names.GYM: _gymnasium,
     names.DM_ENV: _dm_env,
     names.DM_CONTROL: _dm_control,
+    names.DMLAB: _dmlab,
     names.MEMORY_MAZE: _memory_maze,
 }
 """Prefix -> what makes a player of the rest of a name."""

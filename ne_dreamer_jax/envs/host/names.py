@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ne_dreamer_jax.envs.host import opengl
 
-GYM, DM_ENV, DM_CONTROL, MEMORY_MAZE = "gym:", "dm_env:", "dm_control:", "memory_maze:"
+GYM, DM_ENV, DM_CONTROL, DMLAB, MEMORY_MAZE = "gym:", "dm_env:", "dm_control:", "dmlab:", "memory_maze:"
 MAZES = ("9x9", "11x11", "13x13", "15x15")
 
 
@@ -25,6 +25,7 @@ LIBRARIES = {
     GYM: Library("gymnasium", "'ne-dreamer-jax[host]'", "gym:CartPole-v1"),
     DM_ENV: Library("dm_env", "dm-env", "dm_env:mymodule:make"),
     DM_CONTROL: Library("dm_control", "'ne-dreamer-jax[train]'", "dm_control:walker_walk"),
+    DMLAB: Library("deepmind_lab", "its own build, see github.com/google-deepmind/lab", "dmlab:rooms_watermaze"),
     MEMORY_MAZE: Library("memory_maze", "memory-maze", "memory_maze:9x9"),
 }
 
@@ -39,7 +40,7 @@ def check(name: str) -> None:
         if importlib.util.find_spec(package) is None:
             raise ValueError(
                 f"environments {prefix}... need the package {package}, which is not installed; install it with: "
-                f"pip install {install}"
+                f"{'' if install.startswith('its') else 'pip install '}{install}"
             )
     _CHECKS[prefix](name, task)
 
@@ -103,4 +104,15 @@ def _check_maze(name: str, task: str) -> None:
         )
 
 
-_CHECKS = {GYM: _check_gym, DM_ENV: _check_dm_env, DM_CONTROL: _check_dm_control, MEMORY_MAZE: _check_maze}
+def _check_dmlab(name: str, task: str) -> None:
+    if not task.replace("/", "").isidentifier():
+        raise ValueError(f"expected a level of DMLab, such as {LIBRARIES[DMLAB].example}, got {name!r}")
+
+
+_CHECKS = {
+    DMLAB: _check_dmlab,
+    GYM: _check_gym,
+    DM_ENV: _check_dm_env,
+    DM_CONTROL: _check_dm_control,
+    MEMORY_MAZE: _check_maze,
+}
