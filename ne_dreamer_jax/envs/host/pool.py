@@ -347,7 +347,8 @@ class Pools:
         self.should_stop = self.workers.on_failure == "stop"
 
     def close(self) -> None:
-        """Ends all workers."""
+        """Ends all workers; whoever goes on with the environments begins with new ones, and without their failures."""
+        self.failure, self.should_stop = None, False
         with self._lock:
             pools = [*self._pools.values(), *self._idle]
             self._pools, self._idle = {}, []
