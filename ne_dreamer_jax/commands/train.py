@@ -68,7 +68,8 @@ FLAGS = {  # option -> the setting that it changes
     "--logdir",
     type=UserPath(),
     metavar="DIRECTORY",
-    help="Where the run is kept. The same command on the same directory goes on with it.",
+    help="Where the run is kept. The same command on the same directory goes on with it; more --env-steps, and other "
+    "evaluations, are let change.",
 )
 @click.option(
     "--checkpoint-minutes",
@@ -143,24 +144,25 @@ def main(
         for path, value in settings.paths(config).items():
             say(f"{path}={settings.as_text(value)}")
         return
-    from ne_dreamer_jax.runs import checkpoint, progress, training
+    from ne_dreamer_jax.runs import checkpoint, progress, resume, training
     from ne_dreamer_jax.system import compile_cache, parallel
 
     echo = say if process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
-        run_directory.check_same(logdir, config)
+        config = resume.settle(logdir, config)
+        changed = resume.changes(logdir, config)
         if coordinator is not None:
             parallel.connect(coordinator, processes, process)
         find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
         run = training.build(config, mesh=mesh)
-    for line in [*progress.describe(config, run.loop, run.shapes), f"  compiled programs are kept in {kept}"]:
+    for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:
         echo(line)
     with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:
         files = run_directory.RunDirectory(logdir)
         if process == 0:
-            files = stack.enter_context(run_directory.claim(logdir, config))
+            files = stack.enter_context(run_directory.claim(logdir, config, resume.differences))
         code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo)
     raise SystemExit(code)
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from ne_dreamer_jax.config import Config
-from ne_dreamer_jax.runs import progress, run_directory, training
+from ne_dreamer_jax.runs import progress, resume, run_directory, training
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.system import compile_cache
 from ne_dreamer_jax.system.quiet import quiet
@@ -35,7 +35,8 @@ def train(
 ) -> Outcome:
     """Trains an agent, with all that the command has: checkpoints, metrics, evaluations, pictures, resuming.
 
-    Called again with the same configuration and directory it goes on, and ends with the same bits.
+    Called again with the same configuration and directory it goes on, and ends with the same bits. What may change
+    meanwhile says `runs.resume`: more ``loop.env_steps``, and how often and long evaluations are.
 
     Args:
       config: what to train; see `config.preset`.
@@ -58,10 +59,11 @@ def train(
     path = Path(logdir).expanduser()
     config = config if env is None else training.own(config)
     run_directory.check(path)
-    run_directory.check_same(path, config)
+    config = resume.settle(path, config)
+    changed = resume.changes(path, config)
     compile_cache.enable()
     run = training.build(config, env, mesh)
-    for line in progress.describe(config, run.loop, run.shapes):
+    for line in progress.describe(config, run.loop, run.shapes, changed):
         echo(line)
-    with run_directory.claim(path, config) as files:
+    with run_directory.claim(path, config, resume.differences) as files:
         return Outcome(files, training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo))

@@ -156,7 +156,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         return 0
     if not saves.failed:
         checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
-    if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
+    # Frames of this start's last evaluation are newer than a video from before the run went on beyond an earlier end.
+    if run.schedule.evaluation and images_of(run.agent.spec) and not (frames is None and files.video.exists()):
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
         pictures.attempt(
