@@ -72,6 +72,13 @@ FLAGS = {  # option -> the setting that it changes
     "evaluations, are let change.",
 )
 @click.option(
+    "--fork",
+    type=UserPath(),
+    metavar="RUN",
+    help="Begin a new run with the agent of another one's newest checkpoint; replay and environments are new. Settings "
+    "may be others where the agent's shapes, observations and actions are the same.",
+)
+@click.option(
     "--checkpoint-minutes",
     type=click.FloatRange(0),
     metavar="X",
@@ -102,6 +109,7 @@ def main(
     method: str | None,
     assignments: tuple[str, ...],
     logdir: Path | None,
+    fork: Path | None,
     checkpoint_minutes: float,
     devices: int,
     coordinator: str | None,
@@ -145,25 +153,30 @@ def main(
             say(f"{path}={settings.as_text(value)}")
         return
     from ne_dreamer_jax.runs import checkpoint, progress, resume, training
+    from ne_dreamer_jax.runs import fork as forks
     from ne_dreamer_jax.system import compile_cache, parallel
 
     echo = say if process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
         config = resume.settle(logdir, config)
         changed = resume.changes(logdir, config)
+        if fork is not None:
+            forks.check(fork, logdir)
         if coordinator is not None:
             parallel.connect(coordinator, processes, process)
         find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
         run = training.build(config, mesh=mesh)
+        if fork is not None:
+            forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
     for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:
         echo(line)
     with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:
         files = run_directory.RunDirectory(logdir)
         if process == 0:
             files = stack.enter_context(run_directory.claim(logdir, config, resume.differences))
-        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo)
+        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo, parent=fork)
     raise SystemExit(code)
 
 

@@ -190,7 +190,7 @@ def restore(
         candidates = [chosen, *(checkpoint for checkpoint in candidates if checkpoint is not chosen)]
     for checkpoint in candidates:
         for item, tree in like.items():
-            _check_fit(checkpoint, item, tree)
+            check_fit(checkpoint, item, tree)
         try:
             items = {item: _load(checkpoint, item, tree) for item, tree in like.items()}
         except DamagedError as error:
@@ -205,6 +205,14 @@ def restore(
 def checkpoints(directory: Path) -> list[Checkpoint]:
     """The checkpoints whose manifests are intact, newest first."""
     return _find(directory)[0]
+
+
+def digest(found: Checkpoint, item: str) -> str:
+    """SHA-256 over the names, shapes, dtypes and checksums of all arrays of an item: equal for the same content."""
+    leaves = found.items[item]
+    return _digest_json(
+        {name: {key: leaf[key] for key in ("shape", "dtype", "sha256")} for name, leaf in leaves.items()}
+    )
 
 
 def best(found: Collection[Checkpoint]) -> Checkpoint | None:
@@ -356,7 +364,8 @@ def _check_files(checkpoint: Checkpoint, item: str) -> None:
             raise DamagedError(f"{folder} is damaged: {name} is not as it was saved.")
 
 
-def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
+def check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
+    """Raises ValueError where an item's arrays have other names, shapes or dtypes than those of a pytree."""
     expected = {name: _describe(leaf) for name, leaf in _flatten(like).items()}
     got = {name: {key: leaf[key] for key in ("shape", "dtype")} for name, leaf in checkpoint.items[item].items()}
     different = [name for name in dict.fromkeys([*expected, *got]) if expected.get(name) != got.get(name)]

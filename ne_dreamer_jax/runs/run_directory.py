@@ -3,6 +3,7 @@
 =====================  ==================================================================
 ``.ne_dreamer_jax``    the marker that says so; locked while a process trains here
 ``config.json``        the configuration, whole, and its checksum
+``parent.json``        of a run that began with another's agent: which, see `ne_dreamer_jax.runs.fork`
 ``metrics.jsonl``      see `ne_dreamer_jax.metrics`
 ``checkpoints/``       see `ne_dreamer_jax.checkpoint`
 ``evaluation.json``    what the last evaluation found
@@ -49,6 +50,11 @@ class RunDirectory(NamedTuple):
     def config(self) -> Path:
         """The configuration as JSON."""
         return self.path / "config.json"
+
+    @property
+    def parent(self) -> Path:
+        """Which run the agent was taken over from, as JSON; see `runs.fork`."""
+        return self.path / "parent.json"
 
     @property
     def metrics(self) -> Path:
@@ -209,6 +215,11 @@ def read_config(path: Path, cls: type[C]) -> C:
             "with other settings, give them as options, or begin a new run with --fork"
         )
     return config
+
+
+def write_parent(files: RunDirectory, origin: Mapping[str, Any]) -> None:
+    """Stores which run this one's agent is from."""
+    _write_json(files.parent, origin)
 
 
 def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:

@@ -29,7 +29,7 @@ from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
 from ne_dreamer_jax.envs.vector import check_env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
-from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
+from ne_dreamer_jax.runs import checkpoint, fork, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record, Saves, whole
@@ -85,7 +85,9 @@ def build(config: Config, env: Env | None = None, mesh: Mesh | None = None) -> R
     return Run(config, agent, loop, loop.state_shapes(), env.step_seconds)
 
 
-def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
+def train(
+    run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print, parent: Path | None = None
+) -> int:
     """Trains to the end of the budget, from the newest checkpoint if there is one.
 
     Where a run has several processes, all of them call this. The main process alone writes files, and decides what
@@ -95,6 +97,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       files: of a directory that is claimed for this configuration; all processes must see the same.
       checkpoint_minutes: time between checkpoints.
       echo: takes the lines for people.
+      parent: the run whose agent this one begins with, see `runs.fork`; once begun, it goes on without.
 
     Returns:
       The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, `DIVERGED` where
@@ -107,7 +110,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     if parallel.is_main_process() and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
-    state, lines = _start(run, files, start_key, echo)
+    state, lines = _start(run, files, start_key, parent, echo)
     echo(_space(run, files))
     counters = schedule.counters(state)
     pace = progress.Pace(schedule)
@@ -117,6 +120,8 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
     is_main_process = parallel.is_main_process()
     with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
         record = Record(writer, lines, echo)
+        if parallel.agreed(files.parent.exists() and counters.env_step == 0)[0]:
+            saves.whole(state, counters, None)  # from here on it needs its parent no more
         while True:
             step = counters.agent_step // schedule.num_envs
             missing, with_random = parallel.agreed(
@@ -221,7 +226,9 @@ def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
     )
 
 
-def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
+def _start(
+    run: Run, files: RunDirectory, key: jax.Array, parent: Path | None, echo: Echo
+) -> tuple[LoopState, list[dict[str, Any]]]:
     """The state to go on from, and the metrics up to it."""
     shapes, is_main_process = run.shapes, parallel.is_main_process()
     if jax.process_count() > 1:  # each reads the whole and keeps its share
@@ -236,6 +243,9 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     except FileNotFoundError:
         _same_for_all(files, -1)
         state = jax.block_until_ready(run.loop.init(key))
+        parent = parent or fork.parent_of(files)  # which stands there where the first start was cut short
+        if parent is not None:
+            state = _taken_over(run, files, parent, shapes.train, state, echo)
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
         return state, metrics.resume(files.metrics, -1) if is_main_process else []
     for reason in restored.skipped:
@@ -247,6 +257,15 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
     return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if is_main_process else []
+
+
+def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: LoopState, echo: Echo) -> LoopState:
+    """The state with the agent of another run, which ``parent.json`` then names."""
+    train, origin = fork.agent(parent, like, echo)
+    parallel.agreed(0)  # all have looked for a parent before one is written down
+    if parallel.is_main_process():
+        run_directory.write_parent(files, origin)
+    return state._replace(train=parallel.move(train, run.shapes.train))
 
 
 def _space(run: Run, files: RunDirectory) -> str:

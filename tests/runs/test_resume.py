@@ -145,6 +145,7 @@ def test_the_command_refuses_with_a_line_for_each_setting_before_anything_is_com
 
 @pytest.mark.slow
 @pytest.mark.strict
+@pytest.mark.usefixtures("quick_compilation")
 def test_the_real_loop_goes_on_beyond_its_end_to_the_same_bits(tmp_path):
     say = lambda line: None
     for path, config in (
