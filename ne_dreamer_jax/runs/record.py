@@ -114,8 +114,7 @@ class Saves:
                 return
         try:
             checkpoint.save(self._directory, counters.env_step, items, score=score)
-            checkpoint.prune(self._directory, whole=self._items)
-        except (checkpoint.SaveError, OSError) as error:
+        except checkpoint.SaveError as error:
             self.failed = True
             kept = checkpoint.checkpoints(self._directory)
             last = f"the last one is {kept[0].path}" if kept else "there is none yet"
@@ -123,3 +122,11 @@ class Saves:
             return
         self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")
+        self.prune()
+
+    def prune(self, keep: int = 2) -> None:
+        """Removes what `checkpoint.prune` removes; where that can't be, a line says so."""
+        try:
+            checkpoint.prune(self._directory, whole=self._items, keep=keep)
+        except OSError as error:
+            self._echo(f"Could not remove older checkpoints in {self._directory}: {error.strerror or error}.")

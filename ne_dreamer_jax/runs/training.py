@@ -32,7 +32,7 @@ from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, fork, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
-from ne_dreamer_jax.runs.record import Record, Saves, whole
+from ne_dreamer_jax.runs.record import Record, Saves
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.runs.signals import Stop
@@ -104,7 +104,10 @@ def train(
       updates were not finite, `NOT_SAVED` where the last checkpoint could not be written.
 
     Raises:
-      ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
+      checkpoint.DamagedError: there are checkpoints, and none is intact.
+      run_directory.RefusedError: there is one of an agent of other shapes; or the metrics so far are damaged, or can't
+        be written.
+      ValueError: processes that train together see different checkpoints.
     """
     schedule = run.schedule
     if parallel.is_main_process() and run.config.env.task == GIVEN:
@@ -160,7 +163,7 @@ def train(
     if not is_main_process:
         return 0
     if not saves.failed:
-        checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
+        saves.prune(keep=1)  # nothing will go on from here
     # Frames of this start's last evaluation are newer than a video from before the run went on beyond an earlier end.
     if run.schedule.evaluation and images_of(run.agent.spec) and not (frames is None and files.video.exists()):
         if frames is None:  # the run was stopped between its last evaluation and here
@@ -247,7 +250,9 @@ def _start(
         if parent is not None:
             state = _taken_over(run, files, parent, shapes.train, state, echo)
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
-        return state, metrics.resume(files.metrics, -1) if is_main_process else []
+        return state, _lines(files, -1) if is_main_process else []
+    except ValueError as error:
+        raise run_directory.RefusedError(str(error)) from error
     for reason in restored.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
@@ -256,7 +261,17 @@ def _start(
     if run.loop.frames is not None:
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
-    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if is_main_process else []
+    return parallel.move(state, run.shapes), _lines(files, env_step) if is_main_process else []
+
+
+def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
+    """The metrics up to a step; what stands behind it is dropped."""
+    try:
+        return metrics.resume(files.metrics, env_step)
+    except OSError as error:
+        raise run_directory.RefusedError(f"{files.metrics} can't be written: {error.strerror or error}") from error
+    except ValueError as error:
+        raise run_directory.RefusedError(str(error)) from error
 
 
 def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: LoopState, echo: Echo) -> LoopState:
