@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ne_dreamer_jax import envs, settings
-from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, refusing, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, interruptible, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.quiet import quiet
@@ -152,6 +152,21 @@ def main(
         for path, value in settings.paths(config).items():
             say(f"{path}={settings.as_text(value)}")
         return
+    with interruptible():
+        _train(config, logdir, fork, checkpoint_minutes, devices, coordinator, processes, process)
+
+
+def _train(
+    config: Config,
+    logdir: Path,
+    fork: Path | None,
+    checkpoint_minutes: float,
+    devices: int,
+    coordinator: str | None,
+    processes: int,
+    process: int,
+) -> None:
+    """Trains, and ends the program with the run's exit code."""
     from ne_dreamer_jax.runs import checkpoint, progress, resume, training
     from ne_dreamer_jax.runs import fork as forks
     from ne_dreamer_jax.system import compile_cache, parallel

@@ -195,9 +195,9 @@ def read_config(path: Path, cls: type[C]) -> C:
         program. One of an older version, which has no checksum or lacks a field, is taken; see `settings.from_dict`.
     """
     files = RunDirectory(path)
-    if not files.marker.exists() or not files.config.exists():
-        raise RefusedError(f"expected a run directory, with {MARKER} and config.json in it, got {path}")
     try:
+        if not files.marker.exists() or not files.config.exists():
+            raise RefusedError(f"expected a run directory, with {MARKER} and config.json in it, got {path}")
         content = json.loads(files.config.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
             raise ValueError(f"expected a JSON object, got {str(content)[:80]!r}")
@@ -223,8 +223,11 @@ def write_parent(files: RunDirectory, origin: Mapping[str, Any]) -> None:
 
 
 def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:
-    """Stores what an evaluation found, in place of the one before."""
-    _write_json(files.evaluation, result)
+    """Stores what an evaluation found, in place of the one before. Raises RefusedError where that can't be written."""
+    try:
+        _write_json(files.evaluation, result)
+    except OSError as error:
+        raise RefusedError(f"{files.evaluation} can't be written: {error.strerror or error}") from error
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -143,6 +143,7 @@ def train(
                 break
             if chunk is None:
                 chunk = _compile(run, state, echo)
+                continue  # in case that somebody wished to stop meanwhile
             steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
             began = time.perf_counter()
             state, report = chunk(state, steps)
