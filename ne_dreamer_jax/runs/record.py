@@ -116,7 +116,8 @@ class Saves:
             checkpoint.save(self._directory, counters.env_step, items, score=score)
         except checkpoint.SaveError as error:
             self.failed = True
-            kept = checkpoint.checkpoints(self._directory)
+            found = checkpoint.checkpoints(self._directory)
+            kept = [entry for entry in found if set(self._items) <= set(entry.items)]  # training goes on from these
             last = f"the last one is {kept[0].path}" if kept else "there is none yet"
             self._echo(f"Not saved: {error}. Training goes on, and the next attempt is at the next interval; {last}.")
             return
