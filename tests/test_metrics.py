@@ -25,7 +25,8 @@ def test_a_line_is_plain_json_with_counters_first(tmp_path):
         values = {"a": jnp.float32(0.5), "b": np.int32(3), "c": 4, "d": True, "e": math.inf, "f": math.nan}
         writer.write(StepCounts(20, 10, 2), values)
     assert path.read_text() == (
-        '{"env_step": 20, "agent_step": 10, "update": 2, "a": 0.5, "b": 3, "c": 4, "d": 1, "e": null, "f": null}\n'
+        '{"env_step": 20, "agent_step": 10, "update": 2, "a": 0.5, "b": 3, "c": 4, "d": 1, "e": null, "f": null, '
+        '"crc32": 3885388497}\n'
     )
     (line,) = metrics.read(path)
     assert math.isnan(line["e"])
@@ -85,8 +86,25 @@ def test_a_foreign_line_is_refused_by_its_number(tmp_path, text):
     path = tmp_path / "metrics.jsonl"
     write(path, [10])
     path.write_text(path.read_text() + text)
-    with pytest.raises(ValueError, match="line 2: expected a JSON object with env_step, agent_step, update, got"):
+    with pytest.raises(ValueError, match="line 2: expected a JSON object with env_step, agent_step, update, and"):
         metrics.read(path)
+
+
+def test_a_number_that_was_changed_is_refused_and_old_lines_have_no_checksum(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"env_step": 2, "agent_step": 1, "update": 0, "eval/return": 5.5}\n')
+    write(path, [10, 20])
+    assert [line["agent_step"] for line in metrics.read(path)] == [1, 10, 20]
+    text = path.read_text()
+    for old, new in (
+        ('"env_step": 40', '"env_step": 42'),
+        (', "crc32"', ', "crc42"'),
+        ('return": 20.0', 'return": "20"'),
+    ):
+        assert old in text
+        path.write_text(new.join(text.rsplit(old, 1)))
+        with pytest.raises(ValueError, match=r"metrics.jsonl, line [23]: expected .* numbers as they were written"):
+            metrics.read(path)
 
 
 def test_misuse_is_refused(tmp_path):

@@ -35,7 +35,9 @@ def test_the_same_configuration_goes_on_and_finds_everything_as_it_was(tmp_path)
 
 def test_an_empty_directory_is_taken(tmp_path):
     with run_directory.claim(tmp_path, Config(seed=3)):
-        assert json.loads((tmp_path / "config.json").read_text()) == {"task": "dmc/walker_walk", "seed": 3}
+        content = json.loads((tmp_path / "config.json").read_text())
+        assert len(content.pop("sha256")) == 64
+        assert content == {"task": "dmc/walker_walk", "seed": 3}
 
 
 def test_another_run_is_refused_with_what_differs(tmp_path):
@@ -96,11 +98,41 @@ def test_reading_what_is_no_run_or_of_another_version(tmp_path):
     with run_directory.claim(tmp_path, Config()):
         pass
     (tmp_path / "config.json").write_text('{"task": "dmc/walker_walk", "old": 1}')
-    with pytest.raises(RefusedError, match=r"does not fit this version.*missing \['seed'\], unknown \['old'\]"):
+    with pytest.raises(RefusedError, match=r"does not fit this version.*missing \[\], unknown \['old'\]"):
         run_directory.read_config(tmp_path, Config)
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RefusedError, match="does not fit this version"):
-        run_directory.read_config(tmp_path, Config)
+    for text in ("{", "[]", "[" * 100_000, '"task"', "\x00", '{"seed": 1e400}'):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(RefusedError, match="does not fit this version of the program, or is damaged"):
+            run_directory.read_config(tmp_path, Config)
+
+
+def test_a_field_that_an_older_version_did_not_write_has_its_default(tmp_path):
+    (tmp_path / ".ne_dreamer_jax").touch()
+    (tmp_path / "config.json").write_text('{"task": "dmc/walker_run"}')
+    assert run_directory.read_config(tmp_path, Config) == Config("dmc/walker_run", seed=0)
+
+
+def test_a_configuration_that_was_edited_is_refused_by_its_checksum(tmp_path):
+    with run_directory.claim(tmp_path, Config(seed=3)):
+        pass
+    text = (tmp_path / "config.json").read_text()
+    (tmp_path / "config.json").write_text(text.replace('"seed": 3', '"seed": 2'))
+    for call in (
+        lambda: run_directory.read_config(tmp_path, Config),
+        lambda: run_directory.claim(tmp_path, Config(seed=2)).__enter__(),
+    ):
+        with pytest.raises(RefusedError, match=r"config.json is not as it was written: its checksum does not hold"):
+            call()
+
+
+def test_what_may_differ_is_let_through_and_stored(tmp_path):
+    only_task = lambda stored, asked: [] if stored.task == asked.task else ["task"]
+    with run_directory.claim(tmp_path, Config()):
+        pass
+    with run_directory.claim(tmp_path, Config(seed=5), only_task):
+        assert run_directory.read_config(tmp_path, Config) == Config(seed=5)
+    with pytest.raises(RefusedError, match="holds another run"):
+        run_directory.claim(tmp_path, Config("dmc/walker_run"), only_task).__enter__()
 
 
 def test_an_evaluation_replaces_the_one_before(tmp_path):

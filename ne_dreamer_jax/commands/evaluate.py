@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -45,7 +46,7 @@ def main(
     The actions are the policy's mode, the episodes none that training or its evaluations had. The result is printed
     and written to evaluation.json in DIRECTORY. The replay buffer is not read.
     """
-    if not run_directory.RunDirectory(logdir).marker.exists():
+    if not os.path.exists(run_directory.RunDirectory(logdir).marker):  # False for what can be no path, too
         raise click.UsageError(
             f"expected the --logdir of a run, got {logdir}: there is no {run_directory.MARKER} in it"
         )

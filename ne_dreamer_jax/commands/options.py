@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -90,6 +91,15 @@ def refusing(*errors: type[Exception]) -> Iterator[None]:
         yield
     except errors as error:
         raise click.UsageError(str(error)) from error
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Ends the command with exit code 130 on a Ctrl-C for which nothing was prepared, where click's is 1."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def find_devices() -> None:

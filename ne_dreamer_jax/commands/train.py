@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ne_dreamer_jax import envs, settings
-from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, refusing, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, interruptible, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.quiet import quiet
@@ -68,7 +68,15 @@ FLAGS = {  # option -> the setting that it changes
     "--logdir",
     type=UserPath(),
     metavar="DIRECTORY",
-    help="Where the run is kept. The same command on the same directory goes on with it.",
+    help="Where the run is kept. The same command on the same directory goes on with it; more --env-steps, and other "
+    "evaluations, are let change.",
+)
+@click.option(
+    "--fork",
+    type=UserPath(),
+    metavar="RUN",
+    help="Begin a new run with the agent of another one's newest checkpoint; replay and environments are new. Settings "
+    "may be others where the agent's shapes, observations and actions are the same.",
 )
 @click.option(
     "--checkpoint-minutes",
@@ -101,6 +109,7 @@ def main(
     method: str | None,
     assignments: tuple[str, ...],
     logdir: Path | None,
+    fork: Path | None,
     checkpoint_minutes: float,
     devices: int,
     coordinator: str | None,
@@ -143,25 +152,46 @@ def main(
         for path, value in settings.paths(config).items():
             say(f"{path}={settings.as_text(value)}")
         return
-    from ne_dreamer_jax.runs import checkpoint, progress, training
+    with interruptible():
+        _train(config, logdir, fork, checkpoint_minutes, devices, coordinator, processes, process)
+
+
+def _train(
+    config: Config,
+    logdir: Path,
+    fork: Path | None,
+    checkpoint_minutes: float,
+    devices: int,
+    coordinator: str | None,
+    processes: int,
+    process: int,
+) -> None:
+    """Trains, and ends the program with the run's exit code."""
+    from ne_dreamer_jax.runs import checkpoint, progress, resume, training
+    from ne_dreamer_jax.runs import fork as forks
     from ne_dreamer_jax.system import compile_cache, parallel
 
     echo = say if process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
-        run_directory.check_same(logdir, config)
+        config = resume.settle(logdir, config)
+        changed = resume.changes(logdir, config)
+        if fork is not None:
+            forks.check(fork, logdir)
         if coordinator is not None:
             parallel.connect(coordinator, processes, process)
         find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
         run = training.build(config, mesh=mesh)
-    for line in [*progress.describe(config, run.loop, run.shapes), f"  compiled programs are kept in {kept}"]:
+        if fork is not None:
+            forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
+    for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:
         echo(line)
     with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:
         files = run_directory.RunDirectory(logdir)
         if process == 0:
-            files = stack.enter_context(run_directory.claim(logdir, config))
-        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo)
+            files = stack.enter_context(run_directory.claim(logdir, config, resume.differences))
+        code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo, parent=fork)
     raise SystemExit(code)
 
 

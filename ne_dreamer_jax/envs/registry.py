@@ -7,6 +7,7 @@ made; its names stand in a module of their own that loads nothing.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -82,6 +83,8 @@ def check(name: str) -> None:
         return
     if ":" in name and family_of(name) is None:
         module, _, function = name.partition(":")
+        if module.split(".")[0] in sys.stdlib_module_names:  # a configuration may come from anywhere
+            raise ValueError(f"expected a function of a module of your own, got {name!r}, of Python's standard library")
         if all(part.isidentifier() for part in [*module.split("."), function]):
             return
         raise ValueError(f"expected module:function, such as mypackage.envs:make, got {name!r}")

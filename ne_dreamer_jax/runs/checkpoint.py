@@ -5,13 +5,17 @@ else, so that an evaluation never reads the replay; and "frames", images on the 
 
     checkpoints/000000123456/        one checkpoint; the number is the step it was saved at
       manifest.json                  step, score; of each item: the name, shape, dtype and SHA-256
-                                     of every array, and the SHA-256 of every file; and a SHA-256 of all that
-      agent/  loop/  frames/         the items, written by Orbax; numpy's arrays by numpy, which needs no copy
+                                     of every array, and where it stands; the SHA-256 of every file; and a
+                                     SHA-256 of all that
+      agent/  loop/  frames/         the items: the bytes of all arrays one after another in one file, ``arrays``
 
-Orbax loads an array with flipped bits, and casts one of another dtype, without a word. So an item's files are checked
-against the manifest before Orbax opens them, its arrays after, and what is to be read is compared with what is
-expected. A checkpoint is written beside its place and moved there when it is whole and on disk: what a crash cuts
-short is never seen. One that was damaged later is passed over for the one before it.
+They are written here, by one thread and with plain system calls, so that whatever a disk refuses comes out as one
+error, and nothing is left running. Checkpoints of format 2, whose arrays Orbax wrote, still load: Orbax loads an array
+with flipped bits, and casts one of another dtype, without a word, so an item's files are checked against the manifest
+before it opens them, its arrays after, and what is to be read is compared with what is expected.
+
+A checkpoint is written beside its place and moved there when it is whole and on disk: what a crash cuts short is never
+seen. One that was damaged later is passed over for the one before it.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import contextlib
 import hashlib
 import json
 import math
+import os
 import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -32,8 +37,11 @@ from ne_dreamer_jax.files import sync_file, write_text
 from ne_dreamer_jax.system import memory
 
 MANIFEST = "manifest.json"
-FORMAT = 2
+FORMAT = 3
+READABLE = (2, FORMAT)
+ARRAYS = "arrays"
 _PARTIAL = ".partial-"
+_REPLACED = f"{_PARTIAL}old-"  # where a checkpoint stands while another one of the same step takes its place
 
 
 class DamagedError(Exception):
@@ -86,8 +94,9 @@ def save(
     try:
         return _save(directory, step, items, score)
     except OSError as error:
-        cause = error.strerror or str(error)
-        raise SaveError(f"could not save a checkpoint in {error.filename or directory}: {cause}") from error
+        cause, name = error.strerror or str(error), error.filename
+        place = name if isinstance(name, str) and os.path.isabs(name) else directory  # else a name within a folder
+        raise SaveError(f"could not save a checkpoint in {place}: {cause}") from error
     finally:
         with contextlib.suppress(OSError):
             _remove_partial(directory)
@@ -130,36 +139,42 @@ def _save(directory: Path, step: int, items: Mapping[str, Any], score: float | N
     described, files = {}, {}
     for item, tree in items.items():
         arrays = _flatten(tree)
-        described[item] = {name: _describe(array) | _evidence(array) for name, array in arrays.items()}
-        stored, on_host = _stored(arrays)
-        if stored:
-            with _checkpointer() as checkpointer:
-                checkpointer.save((partial / item).absolute(), stored)
-                checkpointer.wait_until_finished()  # where an error of writing comes out
-        for number, (name, array) in enumerate(on_host.items()):
-            (partial / item).mkdir(exist_ok=True)
-            described[item][name]["file"] = file = f"{number}.npy"
-            np.save(partial / item / file, array, allow_pickle=False)
-        written = sorted(path for path in (partial / item).rglob("*") if path.is_file())
-        files[item] = {path.relative_to(partial / item).as_posix(): _digest_file(path) for path in written}
-    content = {
-        "format": FORMAT,
-        "step": step,
-        "score": None if score is None or not math.isfinite(score) else float(score),
-        "items": described,
-        "files": files,
-    }
-    _write_manifest(partial, content)
-    for path in [*partial.rglob("*"), partial]:
-        sync_file(path)
+        places, files[item] = _write_arrays(partial / item, arrays)
+        described[item] = {name: _describe(array) | places[name] for name, array in arrays.items()}
     final = directory / f"{step:012d}"
+    score = None if score is None or not math.isfinite(score) else float(score)
+    saved = Checkpoint(final, step, score, described, files)
+    _write_manifest(partial, saved)
+    for path in [*(partial / item for item in items), partial]:
+        sync_file(path)
     if final.exists():
-        # Aside first, so that at no time a checkpoint stands half removed under its own name.
-        final.rename(directory / f"{_PARTIAL}old-{step:012d}")
+        # Aside first, so that at no time a checkpoint stands half removed under its own name. `_find` knows it there.
+        final.rename(directory / f"{_REPLACED}{step:012d}")
     partial.rename(final)
     sync_file(directory)
     _remove_partial(directory)
-    return _read_manifest(final)
+    return saved
+
+
+def _write_arrays(folder: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Writes arrays to one file, and waits until it is on the disk.
+
+    Returns:
+      Where each array stands, with its checksum; and name -> checksum of the file.
+    """
+    folder.mkdir()
+    places, whole = {}, hashlib.sha256()
+    with (folder / ARRAYS).open("xb") as file:
+        for name, array in arrays.items():
+            data = _bytes(array)
+            places[name] = {"offset": file.tell(), "sha256": hashlib.sha256(data).hexdigest()}
+            if _is_key(array):
+                places[name]["impl"] = str(jax.random.key_impl(array))
+            whole.update(data)
+            file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    return places, {ARRAYS: whole.hexdigest()}
 
 
 def restore(
@@ -178,7 +193,7 @@ def restore(
 
     Raises:
       FileNotFoundError: no checkpoint holds these items.
-      DamagedError: there are some, and none is intact. (What else Orbax may say of intact files comes out as it is.)
+      DamagedError: there are some, and none is intact.
       ValueError: an intact one, but of another structure, shape or dtype, with what was expected and what was got.
     """
     found, skipped = _find(directory)
@@ -190,7 +205,7 @@ def restore(
         candidates = [chosen, *(checkpoint for checkpoint in candidates if checkpoint is not chosen)]
     for checkpoint in candidates:
         for item, tree in like.items():
-            _check_fit(checkpoint, item, tree)
+            check_fit(checkpoint, item, tree)
         try:
             items = {item: _load(checkpoint, item, tree) for item, tree in like.items()}
         except DamagedError as error:
@@ -205,6 +220,14 @@ def restore(
 def checkpoints(directory: Path) -> list[Checkpoint]:
     """The checkpoints whose manifests are intact, newest first."""
     return _find(directory)[0]
+
+
+def digest(found: Checkpoint, item: str) -> str:
+    """SHA-256 over the names, shapes, dtypes and checksums of all arrays of an item: equal for the same content."""
+    leaves = found.items[item]
+    return _digest_json(
+        {name: {key: leaf[key] for key in ("shape", "dtype", "sha256")} for name, leaf in leaves.items()}
+    )
 
 
 def best(found: Collection[Checkpoint]) -> Checkpoint | None:
@@ -234,19 +257,18 @@ def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Co
         if dropped:
             items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}
             files = {item: checkpoint.files[item] for item in items}
-            kept = checkpoint._replace(items=items, files=files)._asdict()
-            del kept["path"]
-            _write_manifest(checkpoint.path, {"format": FORMAT, **kept})
+            _write_manifest(checkpoint.path, checkpoint._replace(items=items, files=files))
         for item in dropped:
             shutil.rmtree(checkpoint.path / item, ignore_errors=True)
 
 
 def _find(directory: Path) -> tuple[list[Checkpoint], list[str]]:
     found, damaged = [], []
-    names = sorted((path for path in directory.glob("*") if path.name.isdigit()), reverse=True)
-    for path in names:
+    places = {path.name.removeprefix(_REPLACED): path for path in directory.glob(f"{_REPLACED}*")}
+    places |= {path.name: path for path in directory.glob("*") if path.name.isdigit()}
+    for name in sorted(places, reverse=True):
         try:
-            found.append(_read_manifest(path))
+            found.append(_read_manifest(places[name]))
         except DamagedError as error:
             damaged.append(str(error))
     return found, damaged
@@ -254,17 +276,24 @@ def _find(directory: Path) -> tuple[list[Checkpoint], list[str]]:
 
 def _discard(path: Path) -> None:
     """Removes a checkpoint; renamed first, so that a crash leaves no half of one under its name."""
-    aside = path.with_name(f"{_PARTIAL}old-{path.name}")
+    aside = path.with_name(f"{_PARTIAL}gone-{path.name}")
     path.rename(aside)
     shutil.rmtree(aside)
 
 
 def _remove_partial(directory: Path) -> None:
+    """Removes what saves and removals that were cut short left; what was to be replaced, and was not, goes back."""
     for path in directory.glob(f"{_PARTIAL}*"):
-        shutil.rmtree(path)
+        place = path.with_name(path.name.removeprefix(_REPLACED))
+        if place != path and not place.exists():
+            path.rename(place)
+        else:
+            shutil.rmtree(path)
 
 
-def _write_manifest(folder: Path, content: dict[str, Any]) -> None:
+def _write_manifest(folder: Path, checkpoint: Checkpoint) -> None:
+    content = {"format": FORMAT, **checkpoint._asdict()}
+    del content["path"]
     text = json.dumps({**content, "sha256": _digest_json(content)}, indent=1)
     write_text(folder / MANIFEST, text, sync=True)
 
@@ -276,11 +305,23 @@ def _read_manifest(folder: Path) -> Checkpoint:
         if digest != _digest_json(content):
             raise ValueError("its checksum does not hold")
         content.pop("notes", None)  # which version 0.1 wrote
-        if content.pop("format") != FORMAT:
-            raise ValueError(f"expected format {FORMAT}; another version of this program wrote it")
-        return Checkpoint(folder, **content)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if (version := content.pop("format")) not in READABLE:
+            raise ValueError(f"expected format {FORMAT}, got {version}: another version of this program wrote it")
+        found = Checkpoint(folder, **content)
+        _check_manifest(found)
+        return found
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{folder}: {MANIFEST} can't be read: {error!r}.") from error
+
+
+def _check_manifest(found: Checkpoint) -> None:
+    """Raises ValueError for names that lead out of the checkpoint's folder, and for a step or score of another kind."""
+    if type(found.step) is not int or not isinstance(found.score, int | float | None):
+        raise ValueError(f"expected numbers for step and score, got {found.step!r} and {found.score!r}")
+    names = [leaf["file"] for leaves in found.items.values() for leaf in leaves.values() if "file" in leaf]
+    for name in [*names, *(name for item in found.files.values() for name in item), *found.items, *found.files]:
+        if not name or name.startswith("/") or not {"", ".", ".."}.isdisjoint(name.split("/")):
+            raise ValueError(f"expected the name of a file in this folder, got {name!r}")
 
 
 def _digest_json(content: dict[str, Any]) -> str:
@@ -309,30 +350,14 @@ def _data(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _stored(arrays: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What goes to Orbax, and what is written by numpy.
-
-    Orbax refuses arrays without elements; those are made anew. In one process of several it gets all, as numpy's, since
-    a ``jax.Array`` would have to be known to all of them.
-    """
-    data = {name: _data(array) for name, array in arrays.items() if math.prod(array.shape)}
-    if jax.process_count() > 1:
-        return {name: np.asarray(array) for name, array in data.items()}, {}
-    on_host = {name: array for name, array in data.items() if isinstance(array, np.ndarray)}
-    return {name: array for name, array in data.items() if name not in on_host}, on_host
-
-
 def _describe(array: Any) -> dict[str, Any]:
     return {"shape": list(array.shape), "dtype": str(array.dtype)}  # a key's dtype names its kind: key<fry>
 
 
-def _evidence(array: Any) -> dict[str, Any]:
-    return {"sha256": _digest(array)} | ({"impl": str(jax.random.key_impl(array))} if _is_key(array) else {})
-
-
-def _digest(array: Any) -> str:
-    data: Any = np.ascontiguousarray(_data(array))
-    return hashlib.sha256(data.reshape(-1).view(np.uint8)).hexdigest()
+def _bytes(array: Any) -> memoryview:
+    """The array's bytes in C order, of which on a CPU no copy is made."""
+    host: Any = np.ascontiguousarray(_data(array))
+    return host.reshape(-1).view(np.uint8).data
 
 
 def _digest_file(path: Path) -> str:
@@ -356,7 +381,8 @@ def _check_files(checkpoint: Checkpoint, item: str) -> None:
             raise DamagedError(f"{folder} is damaged: {name} is not as it was saved.")
 
 
-def _check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
+def check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
+    """Raises ValueError where an item's arrays have other names, shapes or dtypes than those of a pytree."""
     expected = {name: _describe(leaf) for name, leaf in _flatten(like).items()}
     got = {name: {key: leaf[key] for key in ("shape", "dtype")} for name, leaf in checkpoint.items[item].items()}
     different = [name for name in dict.fromkeys([*expected, *got]) if expected.get(name) != got.get(name)]
@@ -376,33 +402,64 @@ def _words(described: dict[str, Any] | None) -> str:
 
 def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
     expected = _flatten(like)
-    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-
-    def target(leaf: Any) -> jax.ShapeDtypeStruct:
-        data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-        sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
-        return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
-
     _check_files(checkpoint, item)
     described, folder = checkpoint.items[item], checkpoint.path / item
     read: dict[str, Any] = {
-        # The view is for bfloat16, which numpy's files know as two bytes.
-        name: np.load(folder / leaf["file"], allow_pickle=False).view(jax.numpy.dtype(leaf["dtype"]))
-        for name, leaf in described.items()
-        if "file" in leaf
+        name: _read_array(folder, leaf) for name, leaf in described.items() if "offset" in leaf or "file" in leaf
     }
-    stored = {name: target(leaf) for name, leaf in expected.items() if math.prod(leaf.shape) and name not in read}
-    if stored:
-        with _checkpointer() as checkpointer:
-            read |= checkpointer.restore(folder.absolute(), stored)
+    read |= _read_by_orbax(folder, {name: leaf for name, leaf in expected.items() if name not in read})
     leaves = []
     for name, leaf in expected.items():
-        saved = described[name]
-        array = read[name] if name in read else jax.numpy.zeros(target(leaf).shape, target(leaf).dtype)
-        if _digest(array) != saved["sha256"]:
+        saved, array = described[name], read.pop(name)
+        if hashlib.sha256(_bytes(array)).hexdigest() != saved["sha256"]:
             raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")
+        if not isinstance(leaf, np.ndarray):
+            array = _placed(array, _target(leaf).sharding)
         leaves.append(jax.random.wrap_key_data(array, impl=saved["impl"]) if _is_key(leaf) else array)
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _read_array(folder: Path, leaf: Mapping[str, Any]) -> np.ndarray:
+    """One array, as numpy's; a key's words. Files of numpy's are of format 2, for what lay on the host."""
+    dtype = np.dtype(np.uint32) if "impl" in leaf else jax.numpy.dtype(leaf["dtype"])
+    if "file" in leaf:  # the view is for bfloat16, which numpy's files know as two bytes
+        return np.load(folder / leaf["file"], allow_pickle=False).view(dtype)
+    shape = _key_shape(leaf) if "impl" in leaf else tuple(leaf["shape"])
+    return np.fromfile(folder / ARRAYS, dtype, math.prod(shape), offset=leaf["offset"]).reshape(shape)
+
+
+def _key_shape(leaf: Mapping[str, Any]) -> tuple[int, ...]:
+    """Of the words of keys."""
+    words = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=leaf["impl"]))).shape
+    return (*leaf["shape"], *words)
+
+
+def _target(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Shape, dtype and place of an array to be read; of a key's words, for a key."""
+    data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+    sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
+
+
+def _placed(array: Any, sharding: Any) -> jax.Array:
+    """An array where it belongs; each device gets its share alone."""
+    if isinstance(array, jax.Array):
+        return array
+    return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
+
+
+def _read_by_orbax(folder: Path, expected: Mapping[str, Any]) -> dict[str, Any]:
+    """The arrays of a checkpoint of format 2; Orbax refused those without elements."""
+    targets = {name: _target(leaf) for name, leaf in expected.items()}
+    stored = {name: target for name, target in targets.items() if math.prod(target.shape)}
+    empty = {
+        name: jax.numpy.zeros(target.shape, target.dtype) for name, target in targets.items() if name not in stored
+    }
+    if not stored:
+        return empty
+    with _checkpointer() as checkpointer:
+        return checkpointer.restore(folder.absolute(), stored) | empty
 
 
 def _checkpointer() -> Any:

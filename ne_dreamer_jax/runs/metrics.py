@@ -2,8 +2,8 @@
 
 Each line holds the counters ``env_step`` (simulator steps, action repeat counted), ``agent_step`` (actions chosen, over
 all environments) and ``update`` (train steps), then names such as ``train/loss/next_embedding``, ``train/return`` or
-``eval/return``. A name that was not measured at that step is absent; a value that was not finite is null, as JSON has
-no other word for it, and reads back as NaN.
+``eval/return``, and at last ``crc32``, a checksum of all before it. A name that was not measured at that step is
+absent; a value that was not finite is null, as JSON has no other word for it, and reads back as NaN.
 
 A run that goes on from a checkpoint first drops the lines past the checkpoint's step (`resume`): they are about to be
 written again, the same but for what starts with ``time/``. So no line stands twice in the file, and one that was cut
@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat
@@ -24,6 +25,7 @@ import numpy as np
 from ne_dreamer_jax.files import replacing
 
 COUNTERS = ("env_step", "agent_step", "update")
+CHECKSUM = "crc32"
 
 
 class StepCounts(NamedTuple):
@@ -49,11 +51,11 @@ class Writer:
         Raises:
           ValueError: a name that is a counter's.
         """
-        taken = sorted(set(values) & set(COUNTERS))
+        taken = sorted(set(values) & {*COUNTERS, CHECKSUM})
         if taken:
-            raise ValueError(f"expected names other than the counters {COUNTERS}, got {taken}")
+            raise ValueError(f"expected names other than the counters {COUNTERS} and {CHECKSUM}, got {taken}")
         line = counters._asdict() | {name: _number(value) for name, value in values.items()}
-        self._file.write(json.dumps(line, allow_nan=False) + "\n")
+        self._file.write(json.dumps(line | {CHECKSUM: _checksum(line)}, allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:
@@ -69,30 +71,47 @@ class Writer:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """All lines of a metrics file, null as NaN; empty where there is no file.
+    """All lines of a metrics file, without their checksums and null as NaN; empty where there is no file.
 
-    A last line without its end, as a crash leaves it, is left out.
+    A last line without its end, as a crash leaves it, is left out. Version 0.2 wrote lines without checksums; they are
+    taken where they come first.
 
     Raises:
-      ValueError: another line that is no JSON object with the counters; the message names file and line.
+      ValueError: another line that is no JSON object of numbers with the counters, or whose checksum does not hold; the
+        message names file and line.
     """
     if not path.exists():
         return []
-    lines = []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), start=1):
-        if not text.endswith("\n"):
+    lines: list[dict[str, Any]] = []
+    checked = False
+    for number, text in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
+        if not text.endswith(b"\n"):
             break
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            line = None
-        if not isinstance(line, dict) or not all(isinstance(line.get(counter), int) for counter in COUNTERS):
+        line = _parse(text)
+        checked = checked or (line is not None and CHECKSUM in line)
+        if line is None or (checked and line.pop(CHECKSUM, None) != _checksum(line)):
             raise ValueError(
-                f"{path}, line {number}: expected a JSON object with {', '.join(COUNTERS)}, got {text.strip()[:80]!r}. "
-                "Remove the line, or restore the file"
+                f"{path}, line {number}: expected a JSON object with {', '.join(COUNTERS)}, and numbers as "
+                f"they were written, got {text.decode(errors='replace').strip()[:80]!r}. Remove the line, or restore "
+                "the file"
             )
         lines.append({name: math.nan if value is None else value for name, value in line.items()})
     return lines
+
+
+def _parse(text: bytes) -> dict[str, Any] | None:
+    """A line as an object of numbers with the counters; None for anything else."""
+    try:
+        line = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(line, dict) or not all(isinstance(line.get(counter), int) for counter in COUNTERS):
+        return None
+    return line if all(value is None or isinstance(value, int | float) for value in line.values()) else None
+
+
+def _checksum(line: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(line).encode())
 
 
 def resume(path: Path, env_step: int) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -22,8 +22,8 @@ NOTHING_LEARNED = (
 )
 
 
-def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
-    """The budget of a run in plain words, a line each."""
+def describe(config: Config, loop: Loop, shapes: LoopState, changed: Sequence[str] = ()) -> list[str]:
+    """The budget of a run in plain words, a line each, and which settings have ``changed`` since its last start."""
     agent, options = config.agent, config.loop
     counts = parameter_counts(shapes.train.params)
     modules = ", ".join(f"{name} {count:,}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
@@ -39,6 +39,7 @@ def describe(config: Config, loop: Loop, shapes: LoopState) -> list[str]:
         f"  memory    replay holds {budget.capacity:,} agent steps in {memory.readable(loop.replay_bytes)}",
         f"  agent     {sum(counts.values()):,} parameters: {modules}",
     ]
+    lines += [f"  changed   {line}" for line in changed]
     return lines if loop.budget.updates or options.replay_ratio == 0 else [*lines, f"  WARNING   {NOTHING_LEARNED}"]
 
 

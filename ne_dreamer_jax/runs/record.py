@@ -114,12 +114,20 @@ class Saves:
                 return
         try:
             checkpoint.save(self._directory, counters.env_step, items, score=score)
-            checkpoint.prune(self._directory, whole=self._items)
-        except (checkpoint.SaveError, OSError) as error:
+        except checkpoint.SaveError as error:
             self.failed = True
-            kept = checkpoint.checkpoints(self._directory)
+            found = checkpoint.checkpoints(self._directory)
+            kept = [entry for entry in found if set(self._items) <= set(entry.items)]  # training goes on from these
             last = f"the last one is {kept[0].path}" if kept else "there is none yet"
             self._echo(f"Not saved: {error}. Training goes on, and the next attempt is at the next interval; {last}.")
             return
         self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")
+        self.prune()
+
+    def prune(self, keep: int = 2) -> None:
+        """Removes what `checkpoint.prune` removes; where that can't be, a line says so."""
+        try:
+            checkpoint.prune(self._directory, whole=self._items, keep=keep)
+        except OSError as error:
+            self._echo(f"Could not remove older checkpoints in {self._directory}: {error.strerror or error}.")

@@ -2,7 +2,8 @@
 
 =====================  ==================================================================
 ``.ne_dreamer_jax``    the marker that says so; locked while a process trains here
-``config.json``        the configuration, whole
+``config.json``        the configuration, whole, and its checksum
+``parent.json``        of a run that began with another's agent: which, see `ne_dreamer_jax.runs.fork`
 ``metrics.jsonl``      see `ne_dreamer_jax.metrics`
 ``checkpoints/``       see `ne_dreamer_jax.checkpoint`
 ``evaluation.json``    what the last evaluation found
@@ -10,18 +11,20 @@
 ``policy.mp4``         one evaluation episode
 =====================  ==================================================================
 
-The same configuration on the same directory goes on; another one, and a directory with anything else in it, is
-refused, so that nothing is ever overwritten but by the run that wrote it. Standard library only.
+The same configuration on the same directory goes on, wherever the directory was moved or copied to; another one (but
+for what `runs.resume` lets change), and a directory with anything else in it, is refused, so that nothing is ever
+overwritten but by the run that wrote it. Standard library only.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import json
 import os
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,6 +33,7 @@ from ne_dreamer_jax.files import write_text
 
 C = TypeVar("C")
 MARKER = ".ne_dreamer_jax"
+_CHECKSUM = "sha256"  # the key in config.json, beside the settings
 _MARKER_TEXT = "A run directory of ne_dreamer_jax. The same command on this directory goes on with the run.\n"
 
 
@@ -46,6 +50,11 @@ class RunDirectory(NamedTuple):
     def config(self) -> Path:
         """The configuration as JSON."""
         return self.path / "config.json"
+
+    @property
+    def parent(self) -> Path:
+        """Which run the agent was taken over from, as JSON; see `runs.fork`."""
+        return self.path / "parent.json"
 
     @property
     def metrics(self) -> Path:
@@ -115,7 +124,11 @@ def check(path: Path) -> None:
         )
 
 
-def check_same(path: Path, config: Any) -> None:
+Differences = Callable[[Any, Any], list[str]]
+"""(a run's configuration, the one that is asked for) -> what differs and may not, a line each."""
+
+
+def check_same(path: Path, config: Any, differences: Differences = settings.differences) -> None:
     """Refuses a directory that holds a run of another configuration; touches nothing.
 
     Raises:
@@ -123,21 +136,22 @@ def check_same(path: Path, config: Any) -> None:
     """
     if not RunDirectory(path).config.exists():
         return
-    different = settings.differences(read_config(path, type(config)), config)
+    different = differences(read_config(path, type(config)), config)
     if different:
-        shown = [*different[:8], *([f"and {len(different) - 8} more"] if len(different) > 8 else [])]
         raise RefusedError(
-            f"{path} holds another run. Give it the same options to go on, or choose another --logdir. "
-            "They differ in\n  " + "\n  ".join(shown)
+            f"{path} holds another run. Give it the same options to go on, choose another --logdir, or begin a new run "
+            f"there from this one's agent with --fork {typed(path)}. They differ in\n  " + "\n  ".join(different)
         )
 
 
 @contextlib.contextmanager
-def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
+def claim(path: Path, config: Any, differences: Differences = settings.differences) -> Iterator[RunDirectory]:
     """Holds a run directory for training, made if need be; nobody else gets it meanwhile.
 
     Args:
-      config: a frozen dataclass (see `ne_dreamer_jax.settings`): everything that decides what the run computes.
+      config: a frozen dataclass (see `ne_dreamer_jax.settings`): everything that decides what the run computes. It
+        takes the place of the one that stands there, where what differs may change.
+      differences: which differences from that one may not be.
 
     Raises:
       RefusedError: as `check` says, or it holds a run of another configuration, or a process trains in it.
@@ -154,43 +168,71 @@ def claim(path: Path, config: Any) -> Iterator[RunDirectory]:
             fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RefusedError(f"another process trains in {path}. Wait for it, or choose another --logdir") from None
-        check_same(path, config)
-        if not files.config.exists():
-            marker.write(_MARKER_TEXT)
-            marker.flush()
-            try:
+        check_same(path, config, differences)
+        try:
+            if not files.config.exists():
+                marker.write(_MARKER_TEXT)
+                marker.flush()
                 store_config(files, config)
-            except OSError as error:
-                raise RefusedError(f"{files.config} can't be written: {error.strerror or error}") from error
+            elif read_config(path, type(config)) != config:
+                store_config(files, config)
+        except OSError as error:
+            raise RefusedError(f"{files.config} can't be written: {error.strerror or error}") from error
         yield files
 
 
 def store_config(files: RunDirectory, config: Any) -> None:
     """Writes the configuration, in place of what stood there."""
-    _write_json(files.config, settings.to_dict(config))
+    content = settings.to_dict(config)
+    _write_json(files.config, content | {_CHECKSUM: _digest(content)})
 
 
 def read_config(path: Path, cls: type[C]) -> C:
     """The configuration of a run.
 
     Raises:
-      RefusedError: there is no run, or its configuration is of another version of this program.
+      RefusedError: there is no run, or its configuration can't be read, is damaged, or is of another version of this
+        program. One of an older version, which has no checksum or lacks a field, is taken; see `settings.from_dict`.
     """
     files = RunDirectory(path)
-    if not files.marker.exists() or not files.config.exists():
-        raise RefusedError(f"expected a run directory, with {MARKER} and config.json in it, got {path}")
     try:
-        return settings.from_dict(cls, json.loads(files.config.read_text(encoding="utf-8")))
-    except ValueError as error:
+        if not files.marker.exists() or not files.config.exists():
+            raise RefusedError(f"expected a run directory, with {MARKER} and config.json in it, got {path}")
+        content = json.loads(files.config.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError(f"expected a JSON object, got {str(content)[:80]!r}")
+        checksum = content.pop(_CHECKSUM, None)
+        config = settings.from_dict(cls, content)
+    except OSError as error:
+        raise RefusedError(f"{files.config} can't be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
         raise RefusedError(
-            f"{files.config} does not fit this version of the program, or was edited by hand: {error}"
+            f"{files.config} does not fit this version of the program, or is damaged: {str(error)[:500]}"
         ) from error
+    if checksum is not None and checksum != _digest(content):
+        raise RefusedError(
+            f"{files.config} is not as it was written: its checksum does not hold. Restore it from a copy; to go on "
+            "with other settings, give them as options, or begin a new run with --fork"
+        )
+    return config
+
+
+def write_parent(files: RunDirectory, origin: Mapping[str, Any]) -> None:
+    """Stores which run this one's agent is from."""
+    _write_json(files.parent, origin)
 
 
 def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:
-    """Stores what an evaluation found, in place of the one before."""
-    _write_json(files.evaluation, result)
+    """Stores what an evaluation found, in place of the one before. Raises RefusedError where that can't be written."""
+    try:
+        _write_json(files.evaluation, result)
+    except OSError as error:
+        raise RefusedError(f"{files.evaluation} can't be written: {error.strerror or error}") from error
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    write_text(path, json.dumps(content, indent=2) + "\n")
+    write_text(path, json.dumps(content, indent=2) + "\n", sync=True)
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

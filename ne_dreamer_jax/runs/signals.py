@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import socket
+import sys
+import threading
 from collections.abc import Callable
 from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+GRACE = 0.5
+"""Seconds that the main thread has to leave by itself after a second signal."""
 
 
 class Stop:
     """Within the block, the first SIGINT, SIGTERM or SIGHUP is kept in `signal`.
 
-    A second SIGINT or SIGTERM acts as it always does. A second SIGHUP is none's wish, as a terminal that is closed
-    sends several. A signal that was ignored before (``nohup``, a job in a script's background) stays ignored.
+    A second SIGINT or SIGTERM acts as it always does; where the main thread does not come to that within `GRACE`, since
+    it compiles or computes, the process ends there and then, with 128 + the signal's number, but for one in which
+    somebody types. A second SIGHUP is none's wish, as a terminal that is closed sends several. A signal that was
+    ignored before (``nohup``, a job in a script's background) stays ignored.
     """
 
     def __init__(self, echo: Callable[[str], None]) -> None:
@@ -24,13 +32,26 @@ class Stop:
     def __enter__(self) -> Stop:
         heeded = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         self._before = {number: signal.signal(number, self._ask) for number in heeded}
+        self._over = threading.Event()
+        self._woken, waking = socket.socketpair()
+        self._waking = waking
+        waking.setblocking(False)
+        self._wakeup_before = signal.set_wakeup_fd(waking.fileno(), warn_on_full_buffer=False)
+        self._watcher = threading.Thread(target=self._watch, name="signals", daemon=True)
+        self._watcher.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._over.set()
+        signal.set_wakeup_fd(self._wakeup_before)
+        self._waking.close()  # which ends the watcher
+        self._watcher.join()
+        self._woken.close()
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _ask(self, number: int, _: FrameType | None) -> None:
+        """In the main thread, as soon as it runs Python again."""
         self.signal = number
         for other, handler in self._before.items():
             signal.signal(other, signal.SIG_IGN if other == signal.SIGHUP else handler)
@@ -38,3 +59,13 @@ class Stop:
             self._echo(
                 "\nStopping when this chunk is done, to save a checkpoint. A second time stops at once, without."
             )
+
+    def _watch(self) -> None:
+        """In a thread of its own, which hears of signals while the main thread is in a library."""
+        heard = 0
+        while received := self._woken.recv(16):
+            for number in received:
+                heard += number in self._before and number != signal.SIGHUP
+                typed = number == signal.SIGINT and hasattr(sys, "ps1")
+                if heard >= 2 and not typed and not self._over.wait(GRACE):
+                    os._exit(128 + number)

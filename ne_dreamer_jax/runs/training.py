@@ -29,10 +29,10 @@ from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
 from ne_dreamer_jax.envs.vector import Host, VectorEnv, check_env
 from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
-from ne_dreamer_jax.runs import checkpoint, metrics, pictures, plots, progress, run_directory, video
+from ne_dreamer_jax.runs import checkpoint, fork, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
-from ne_dreamer_jax.runs.record import Record, Saves, whole
+from ne_dreamer_jax.runs.record import Record, Saves
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.runs.signals import Stop
@@ -87,7 +87,9 @@ def build(config: Config, env: Env | VectorEnv | None = None, mesh: Mesh | None 
     return Run(config, agent, loop, loop.state_shapes(), env.step_seconds, host)
 
 
-def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print) -> int:
+def train(
+    run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, echo: Echo = print, parent: Path | None = None
+) -> int:
     """Trains to the end of the budget, from the newest checkpoint if there is one; ends the environments' processes.
 
     Where a run has several processes, all of them call this. The main process alone writes files, and decides what
@@ -97,6 +99,7 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       files: of a directory that is claimed for this configuration; all processes must see the same.
       checkpoint_minutes: time between checkpoints.
       echo: takes the lines for people.
+      parent: the run whose agent this one begins with, see `runs.fork`; once begun, it goes on without.
 
     Returns:
       The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, `DIVERGED` where
@@ -104,13 +107,16 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
       environments in worker processes failed.
 
     Raises:
-      ValueError, checkpoint.DamagedError: there are checkpoints, and none that can be used; the message says why.
+      checkpoint.DamagedError: there are checkpoints, and none is intact.
+      run_directory.RefusedError: there is one of an agent of other shapes; or the metrics so far are damaged, or can't
+        be written.
+      ValueError: processes that train together see different checkpoints.
     """
     if run.host is None:
-        return _train(run, files, checkpoint_minutes, echo)
+        return _train(run, files, checkpoint_minutes, echo, parent)
     echo(NO_EXACT_RESUME)
     try:
-        return _train(run, files, checkpoint_minutes, echo)
+        return _train(run, files, checkpoint_minutes, echo, parent)
     except jax.errors.JaxRuntimeError:
         if run.host.failure is None:
             raise
@@ -121,12 +127,12 @@ def train(run: Run, files: RunDirectory, *, checkpoint_minutes: float = 15.0, ec
         run.host.close()
 
 
-def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo) -> int:
+def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo, parent: Path | None) -> int:
     schedule = run.schedule
     if parallel.is_main_process() and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
-    state, lines = _start(run, files, start_key, echo)
+    state, lines = _start(run, files, start_key, parent, echo)
     echo(_space(run, files))
     counters = schedule.counters(state)
     pace = progress.Pace(schedule)
@@ -136,6 +142,8 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo)
     is_main_process = parallel.is_main_process()
     with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
         record = Record(writer, lines, echo)
+        if parallel.agreed(files.parent.exists() and counters.env_step == 0)[0]:
+            saves.whole(state, counters, None)  # from here on it needs its parent no more
         while True:
             step = counters.agent_step // schedule.num_envs
             missing, with_random = parallel.agreed(
@@ -154,6 +162,7 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo)
                 break
             if chunk is None:
                 chunk = _compile(run, state, echo)
+                continue  # in case that somebody wished to stop meanwhile
             steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
             began = time.perf_counter()
             state, report = chunk(state, steps)
@@ -180,8 +189,9 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo)
     if not is_main_process:
         return 0
     if not saves.failed:
-        checkpoint.prune(files.checkpoints, whole=whole(run.loop.frames), keep=1)  # nothing will go on from here
-    if run.schedule.evaluation and images_of(run.agent.spec) and not files.video.exists():
+        saves.prune(keep=1)  # nothing will go on from here
+    # Frames of this start's last evaluation are newer than a video from before the run went on beyond an earlier end.
+    if run.schedule.evaluation and images_of(run.agent.spec) and not (frames is None and files.video.exists()):
         if frames is None:  # the run was stopped between its last evaluation and here
             frames = evaluate(run, state, evaluation_key, False, echo)[1]
         pictures.attempt(
@@ -248,7 +258,9 @@ def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
     )
 
 
-def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[LoopState, list[dict[str, Any]]]:
+def _start(
+    run: Run, files: RunDirectory, key: jax.Array, parent: Path | None, echo: Echo
+) -> tuple[LoopState, list[dict[str, Any]]]:
     """The state to go on from, and the metrics up to it."""
     shapes, is_main_process = run.shapes, parallel.is_main_process()
     if jax.process_count() > 1:  # each reads the whole and keeps its share
@@ -263,8 +275,13 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     except FileNotFoundError:
         _same_for_all(files, -1)
         state = jax.block_until_ready(run.loop.init(key))
+        parent = parent or fork.parent_of(files)  # which stands there where the first start was cut short
+        if parent is not None:
+            state = _taken_over(run, files, parent, shapes.train, state, echo)
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
-        return state, metrics.resume(files.metrics, -1) if is_main_process else []
+        return state, _lines(files, -1) if is_main_process else []
+    except ValueError as error:
+        raise run_directory.RefusedError(str(error)) from error
     for reason in restored.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
@@ -273,7 +290,26 @@ def _start(run: Run, files: RunDirectory, key: jax.Array, echo: Echo) -> tuple[L
     if run.loop.frames is not None:
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
-    return parallel.move(state, run.shapes), metrics.resume(files.metrics, env_step) if is_main_process else []
+    return parallel.move(state, run.shapes), _lines(files, env_step) if is_main_process else []
+
+
+def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
+    """The metrics up to a step; what stands behind it is dropped."""
+    try:
+        return metrics.resume(files.metrics, env_step)
+    except OSError as error:
+        raise run_directory.RefusedError(f"{files.metrics} can't be written: {error.strerror or error}") from error
+    except ValueError as error:
+        raise run_directory.RefusedError(str(error)) from error
+
+
+def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: LoopState, echo: Echo) -> LoopState:
+    """The state with the agent of another run, which ``parent.json`` then names."""
+    train, origin = fork.agent(parent, like, echo)
+    parallel.agreed(0)  # all have looked for a parent before one is written down
+    if parallel.is_main_process():
+        run_directory.write_parent(files, origin)
+    return state._replace(train=parallel.move(train, run.shapes.train))
 
 
 def _space(run: Run, files: RunDirectory) -> str:

@@ -78,8 +78,10 @@ def to_dict(config: Any) -> dict[str, Any]:
 def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
     """What `to_dict` gave, as a configuration again.
 
+    A field that is missing has its default: an older version, which had no such field, wrote the data.
+
     Raises:
-      ValueError: a missing or unknown field, or a value that does not fit its annotation.
+      ValueError: an unknown field, a missing one without a default, or a value that does not fit its annotation.
     """
     return _decode(cls, data, cls.__name__)
 
@@ -107,6 +109,16 @@ def _example(config: Any) -> str:
 def _fields(cls: type) -> dict[str, Any]:
     hints = ranges.hints_of(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
+
+
+def _required(cls: type) -> set[str]:
+    """The fields without a default."""
+    none = dataclasses.MISSING
+    return {
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.init and field.default is none and field.default_factory is none
+    }
 
 
 def _choices(annotation: Any) -> list[Any]:
@@ -251,12 +263,10 @@ def _decode_one(annotation: Any, data: Any, path: str, *, default: str | None, t
             raise _Unfit
         given = {name: value for name, value in data.items() if not (tagged and name == TAG)}
         hints = _fields(annotation)
-        missing, unknown = [*(hints.keys() - given.keys())], [*(given.keys() - hints.keys())]
+        missing, unknown = sorted(_required(annotation) - given.keys()), sorted(given.keys() - hints.keys())
         if missing or unknown:
-            raise ValueError(
-                f"{path}: expected the fields {sorted(hints)}; missing {sorted(missing)}, unknown {sorted(unknown)}"
-            )
-        return annotation(**{name: _decode(hints[name], given[name], f"{path}.{name}") for name in hints})
+            raise ValueError(f"{path}: expected the fields {sorted(hints)}; missing {missing}, unknown {unknown}")
+        return annotation(**{name: _decode(hints[name], given[name], f"{path}.{name}") for name in given})
     if _is_mapping(annotation) and isinstance(data, Mapping):
         return {name: _decode(arguments[1], value, f"{path}.{name}") for name, value in data.items()}
     if origin is tuple and isinstance(data, list):

@@ -23,10 +23,11 @@ def build(config, *, image: bool = True) -> training.Run:
     n = config.loop.num_envs
     total = config.loop.env_steps // n
     prefill = config.loop.prefill // n
+    rows = -(-(config.loop.capacity or total * n) // n)
     observation = {"image": ArraySpec((16, 16, 3), jnp.uint8)} if image else {"position": ArraySpec((1,), jnp.float32)}
 
     picture = ArraySpec((2, 2, 3), jnp.uint8)
-    frames = HostFrames(total, n, {"image": picture}) if config.loop.storage == "host" else None
+    frames = HostFrames(rows, n, {"image": picture}) if config.loop.storage == "host" else None
 
     def init(key: Array) -> LoopState:
         start_key, key = jax.random.split(key)
@@ -34,7 +35,7 @@ def build(config, *, image: bool = True) -> training.Run:
         params = {"actor": {"kernel": jax.random.normal(start_key, (3,))}}
         scale = ReturnScale(jnp.zeros(()), jnp.zeros(()))
         train = TrainState(params, {}, {}, (), scale, jnp.copy(start_key), zeros[0])
-        replay = jnp.zeros((total, n), jnp.uint8)
+        replay = jnp.zeros((rows, n), jnp.uint8)
         return LoopState(train, (), (), replay, (), Counters(*zeros[1:]), key)  # type: ignore[arg-type]
 
     def step(state: LoopState) -> LoopState:
@@ -47,9 +48,9 @@ def build(config, *, image: bool = True) -> training.Run:
         if frames is not None:  # replay is a sum of all that the host keeps
             images = jax.random.bits(noise_key, (n, *picture.shape), jnp.uint8)
             tickets = frames.put("image", frames.tickets(done), images)
-            back = frames.get("image", jnp.minimum(jnp.arange(total)[:, None], done) * n + (tickets % n)[None])
+            back = frames.get("image", jnp.minimum(jnp.arange(rows)[:, None], done) * n + (tickets % n)[None])
             drawn = jnp.sum(back, axis=(0, 2, 3, 4), dtype=jnp.uint8)
-        replay = state.replay.at[done].set(drawn)
+        replay = state.replay.at[done % rows].set(drawn)
         return state._replace(
             train=train, replay=replay, counters=Counters(done + 1, done, state.counters.skipped), key=key
         )
@@ -84,8 +85,8 @@ def build(config, *, image: bool = True) -> training.Run:
         chunk,
         evaluate,
         state_shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
-        budget=Budget(n, config.env.action_repeat, total, prefill, 1, 1, total * n, config.loop.chunk_steps),
-        replay_bytes=total * n,
+        budget=Budget(n, config.env.action_repeat, total, prefill, 1, 1, rows * n, config.loop.chunk_steps),
+        replay_bytes=rows * n,
         frames=frames,
     )
     return training.Run(config, agent, loop, loop.state_shapes())  # type: ignore[arg-type]

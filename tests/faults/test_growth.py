@@ -1,0 +1,45 @@
+"""A process does not grow with what it has done: chunks, saves and evaluations."""
+
+import gc
+import sys
+from pathlib import Path
+
+import pytest
+
+from ne_dreamer_jax.runs import run_directory, training
+from tests.experiments import stub, toy
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="expected /proc/self/statm")
+PAGE = 4096
+
+
+def resident():
+    """Bytes of this process in memory."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+def growth(path, chunks):
+    """How many bytes a process grows by over the second half of so many chunks, all of them saved, some evaluated."""
+    config = toy.config(env_steps=8 * chunks, chunk_steps=4, eval_every=8 * (chunks // 12), capacity=80)
+    run, sizes, said = stub.build(config, image=False), [], 0
+
+    def echo(line):
+        nonlocal said
+        said += "env step" in line and "updates/s" in line
+        if "env step" in line and said in (chunks // 2, chunks - 5):
+            sizes.append(resident())
+
+    with run_directory.claim(path, config) as files:
+        assert training.train(run, files, checkpoint_minutes=0, echo=echo) == 0
+    return sizes[-1] - sizes[0]
+
+
+@pytest.mark.parametrize("chunks", [60, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_memory_stays_what_it_is(tmp_path, monkeypatch, chunks):
+    if chunks < 1_000:  # the first ten curves fill matplotlib's caches
+        monkeypatch.setattr(training, "draw", lambda *_: None)
+    grown = growth(tmp_path / "run", chunks)
+    print(f"{grown / chunks * 2:,.0f} bytes a chunk")
+    # Metrics of a chunk stay at hand for the curve: some 1.2 kB. The allocator takes pages in larger pieces.
+    assert grown < 500_000 + 2_000 * chunks
