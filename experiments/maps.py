@@ -62,11 +62,11 @@ def main(task: str, player: str, seed: int, image_size: int, output: Path) -> No
     frames beside it were seen. A dotted circle is what can't be seen.
     """
     quiet()
-    with refusing(ValueError, run_directory.RefusedError, FileNotFoundError):
+    from ne_dreamer_jax.runs import checkpoint, maps, pictures, video
+
+    with refusing(ValueError, run_directory.RefusedError, FileNotFoundError, checkpoint.DamagedError):
         find_devices()
         seen, seconds = played(task, player, seed, image_size)
-    from ne_dreamer_jax.runs import maps, pictures, video
-
     output.mkdir(parents=True, exist_ok=True)
     stem, title = output / task.removeprefix("rooms/"), f"{task}, {Path(player).name}"
     draw = {
@@ -86,7 +86,7 @@ def played(task: str, player: str, seed: int, image_size: int = 64) -> tuple[See
 
     Raises:
       ValueError: a run whose agent is not made for the task's frames and actions.
-      RefusedError, FileNotFoundError: as of ``runs.evaluation.load``.
+      RefusedError, FileNotFoundError, DamagedError: as of ``runs.evaluation.load``.
     """
     import jax
 

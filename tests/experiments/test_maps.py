@@ -1,5 +1,6 @@
 """Rooms tasks from above: what is played, drawn and refused."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -10,9 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from experiments import maps as command
+from ne_dreamer_jax import make_agent
+from ne_dreamer_jax.envs.config import RoomsConfig
 from ne_dreamer_jax.envs.rooms import names, nonmatching, players, tasks
 from ne_dreamer_jax.envs.rooms.game import State
-from ne_dreamer_jax.runs import maps, video
+from ne_dreamer_jax.runs import evaluation, maps, video
+from tests.experiments import toy
 
 NAME = "rooms/select_nonmatching_object_small"
 
@@ -84,3 +88,21 @@ def test_a_mistyped_name_is_told_before_jax_loads():
     code = "import sys; from experiments import maps; assert 'jax' not in sys.modules; maps.main(['rooms/watermase'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2, done.stderr
+
+
+@pytest.mark.slow
+def test_the_policy_of_a_run_plays(monkeypatch):
+    """In its own task, and in none that looks otherwise."""
+    options = RoomsConfig(NAME, image_size=16, length=5)
+    env, agent_config = tasks.make(NAME, image_size=16, length=5), toy.config().agent
+    agent = make_agent(agent_config, env.spec)
+    config = dataclasses.replace(toy.config(), env=options)
+    state = agent.init(jax.random.key(0))
+    monkeypatch.setattr(evaluation, "load", lambda path: evaluation.Loaded(config, env, agent, state, None, ()))
+    seen, seconds = command.played(NAME, "a run", 0)
+    assert seen.image.shape == (6, 16, 16, 3)
+    assert seconds == pytest.approx(4 / 60)
+    other = make_agent(agent_config, tasks.make(NAME, image_size=32).spec)
+    monkeypatch.setattr(evaluation, "load", lambda path: evaluation.Loaded(config, env, other, state, None, ()))
+    with pytest.raises(ValueError, match=r"a run: expected an agent for .*16, 16.* got one for .*32, 32"):
+        command.played(NAME, "a run", 0)
