@@ -37,7 +37,7 @@ class PlayerName(click.ParamType):
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.argument("task", type=Name("Rooms task", names.NAMES))
+@click.argument("task", type=Name("Rooms task", names.NAMES), metavar="TASK")
 @click.option(
     "--player",
     type=PlayerName(),
