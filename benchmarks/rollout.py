@@ -48,13 +48,16 @@ def main(
 
     runs: dict[str, tuple[str, int]] = {}
     cases: dict[str, Callable[[], Any]] = {}
+    options: Callable[[str], dict[str, Any]] = lambda task: (
+        {"obs": obs, "action_repeat": action_repeat} if task.startswith("dmc/") else {}
+    )
     for task in dict.fromkeys(tasks):
         for n in dict.fromkeys(counts):
             runs[name := f"{task} x {n}"] = (task, n)
-            cases[name] = _rollout(task, n, obs, action_repeat, steps)
+            cases[name] = rollout(task, n, steps, **options(task))
             if fast and task.startswith("dmc/"):
                 runs[name := f"{task} x {n}, fast"] = (task, n)
-                cases[name] = _rollout(task, n, obs, action_repeat, steps, fast=True)
+                cases[name] = rollout(task, n, steps, **options(task), fast=True)
             if with_mjx and task.startswith("dmc/"):
                 runs[name := f"{task} x {n}, mjx.step"] = (task, n)
                 cases[name] = _mjx_steps(task, n, action_repeat, steps)
@@ -71,14 +74,16 @@ def main(
     common.report("rollout", measured, settings=settings, columns=columns)
 
 
-def _rollout(task: str, num_envs: int, obs: str, action_repeat: int, steps: int, **options: Any) -> Callable[[], Any]:
-    """A function that goes on for some steps from where its last call left off. Its first call compiles it."""
+def rollout(task: str, num_envs: int, steps: int, **options: Any) -> Callable[[], Any]:
+    """A function that goes on for some steps from where its last call left off. Its first call compiles it.
+
+    Args:
+      options: of the environment.
+    """
     import jax
 
     from ne_dreamer_jax.envs import conformance
 
-    if task.startswith("dmc/"):
-        options = {"obs": obs, "action_repeat": action_repeat, **options}
     env = envs.make(task, **options)
 
     def run(state: Any, key: jax.Array) -> tuple[Any, Any]:

@@ -1,5 +1,7 @@
 """The Rooms tasks: DMLab's rules, each played; and scripted players, who say what there is to reach."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,25 @@ import pytest
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax.envs import base, conformance
 from ne_dreamer_jax.envs.config import RoomsConfig
-from ne_dreamer_jax.envs.rooms import collect, deferred, draw, movement, names, nonmatching, players, tasks, watermaze
+from ne_dreamer_jax.envs.rooms import (
+    collect,
+    deferred,
+    draw,
+    layout,
+    movement,
+    names,
+    nonmatching,
+    players,
+    tasks,
+    watermaze,
+)
 from ne_dreamer_jax.envs.rooms.game import make_core
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 NOWHERE = movement.Solids(jnp.zeros((0, 4)), jnp.zeros((0,), bool), jnp.zeros((0, 3)))
 IDLE = 8
+SMALL_NONMATCHING = "rooms/select_nonmatching_object_small"
 
 
 def walked(controls, frames, solids=NOWHERE, body=None):
@@ -202,7 +216,7 @@ def test_two_rooms_have_cakes_and_one_room_has_none():
 def test_the_pad_teleports_for_one_and_the_choice_begins_a_new_map_with_the_same_match():
     played = Played(nonmatching.make(), 180)
     before = played.task
-    np.testing.assert_array_equal(played.state.position, nonmatching.START)
+    np.testing.assert_array_equal(played.state.position, nonmatching.places().start)
     assert float(played.state.yaw) == 0.0
     played.put((64.0, -64.0))
     assert played.act() == 1.0
@@ -212,17 +226,17 @@ def test_the_pad_teleports_for_one_and_the_choice_begins_a_new_map_with_the_same
     for _ in range(4):
         played.act()  # in the air the player keeps going
     assert float(played.state.core.position[0]) == pytest.approx(288 + 102, abs=25)
-    played.put(nonmatching.CHOICES[int(before.place)])
+    played.put(nonmatching.places().choices[int(before.place)])
     assert played.act() == 10.0
-    np.testing.assert_array_equal(played.state.core.position, nonmatching.START)
+    np.testing.assert_array_equal(played.state.core.position, nonmatching.places().start)
     assert int(played.task.match) == int(before.match)
-    played.put(nonmatching.CHOICES[1 - int(played.task.place)])
+    played.put(nonmatching.places().choices[1 - int(played.task.place)])
     assert played.act() == -10.0
 
 
 def test_examples_can_be_seen_and_not_reached():
     played = Played(nonmatching.make(), 180)
-    for spot, yaw in zip(nonmatching.EXAMPLES, (0.6, -0.6), strict=True):
+    for spot, yaw in zip(nonmatching.places().examples, (0.6, -0.6), strict=True):
         played.put((-60.0, float(spot[1])), 0.0)
         for _ in range(30):
             played.act(0)
@@ -371,38 +385,44 @@ def test_thirty_six_objects_look_different():
 # Scripted players.
 
 
-def returns_of(game, policy, steps, episodes=16, memory=None):
-    """Returns of whole episodes, [episodes]; ``policy(core state, memory, key) -> action, memory``."""
+def returns_of(game, player, steps, episodes=16):
+    """Returns of whole episodes, [episodes]."""
     env = base.from_core(
         make_core(game, steps, 8)._replace(observe=lambda state: {"image": jnp.zeros((8, 8, 3), jnp.uint8)})
     )
 
-    def episode(key):
-        state, _ = env.step(env.prepare(key), jnp.zeros((), jnp.int32))
+    def step(carry):
+        state, kept, done, total, key = carry
+        key, act_key = jax.random.split(key)
+        action, kept = jax.vmap(player.act)(state.core, kept, jax.random.split(act_key, episodes))
+        state, timestep = jax.vmap(env.step)(state, action)
+        return state, kept, done | timestep.is_last, total + jnp.where(done, 0.0, timestep.reward), key
 
-        def step(carry, key):
-            state, memory, done, total = carry
-            action, memory = policy(state.core, memory, key)
-            state, timestep = env.step(state, action)
-            total = total + jnp.where(done, 0.0, timestep.reward)
-            return (state, memory, done | timestep.is_last, total), None
+    @jax.jit
+    def play(key):
+        key, reset_key = jax.random.split(key)
+        state, _ = jax.vmap(env.reset)(jax.random.split(reset_key, episodes))
+        kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *x.shape)), player.start)
+        begin = (state, kept, jnp.zeros((episodes,), bool), jnp.zeros((episodes,)), key)
+        return jax.lax.while_loop(lambda carry: ~carry[2].all(), step, begin)[3]
 
-        carry = (state, memory, jnp.zeros((), bool), jnp.zeros(()))
-        return jax.lax.scan(step, carry, jax.random.split(key, steps))[0][3]
-
-    return np.asarray(jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(5), episodes)))
+    return np.asarray(play(jax.random.key(5)))
 
 
-def at_random(state, memory, key):
-    return jax.random.randint(key, (), 0, 9, jnp.int32), memory
+@pytest.fixture
+def whole_compilation():
+    """For what computes longer than it compiles."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.mark.slow
-def test_a_player_collects_what_is_good():
-    best = returns_of(collect.make(collect.TRAIN), lambda s, m, k: (players.collects(s), m), 900)
-    assert best.mean() > 8.5
-    assert np.median(best) == 10
-    assert abs(returns_of(collect.make(collect.TRAIN), at_random, 900).mean()) < 1.5
+@pytest.mark.parametrize("name", list(tasks.COLLECT))
+def test_a_player_collects_what_is_good(name, whole_compilation):
+    assert returns_of(tasks.game(name), players.scripted(name), 900).min() >= 10
+    assert abs(returns_of(tasks.game(name), players.RANDOM, 900).mean()) < 1.5
 
 
 @pytest.mark.slow
@@ -410,36 +430,103 @@ def test_a_player_collects_what_is_good():
     ("configs", "optimum"),
     [(deferred.TRAIN[:1], 10), (deferred.TRAIN[1:2], 10), (deferred.TRAIN[2:], 100), (deferred.TEST, 87)],
 )
-def test_a_player_defers_and_reaches_the_optimum(configs, optimum):
-    best = returns_of(deferred.make(configs), lambda s, m, k: (players.defers(s), m), 900)
-    assert best.max() == optimum
-    assert best.mean() > 0.8 * optimum
+def test_a_player_defers_and_reaches_the_optimum(configs, optimum, whole_compilation):
+    player = players.scripted("rooms/exploit_deferred_effects")
+    assert returns_of(deferred.make(configs), player, 900).min() >= optimum
 
 
-def test_memory_is_worth_much_in_nonmatching():
-    def play(remembers):
-        def policy(state, memory, key):
-            # One coin a map, as one that does not know better chooses.
-            coin = jax.random.bernoulli(
-                jax.random.fold_in(jax.random.key(0), state.task.other + 36 * state.task.example)
-            )
-            return players.selects(state, remembers, coin), memory
+def test_a_way_leads_between_what_is_shunned():
+    """Around a row of objects whose gaps are wide enough, and not through a wall or a door that is closed."""
+    at = lambda *places: jnp.array(places, jnp.float32)
+    items = at((-208.0, 0.0), *((32.0, -240.0 + 120 * j) for j in range(5)), (640.0, 0.0))
+    wanted, shunned = jnp.arange(7) == 0, (jnp.arange(7) > 0) & (jnp.arange(7) < 6)
+    walls = movement.Solids(
+        jnp.asarray(layout.around(deferred.ROOM_1), jnp.float32), jnp.ones((4,), bool), jnp.zeros((0, 3))
+    )
+    way = lambda wanted, shunned: np.asarray(
+        players.remaining(
+            players.DEFERRING,
+            players.distances(players.DEFERRING, walls, items, wanted, shunned),
+            jnp.array([272.0, 0.0]),
+        )
+    )
+    straight, around = way(wanted, jnp.zeros((7,), bool)), way(wanted, shunned)
+    assert straight == pytest.approx(480.0 - 44.0, abs=10)
+    assert straight + 20 < around < straight + 120
+    assert np.isinf(way(jnp.arange(7) == 6, shunned)), "the other room is beyond the wall"
 
-        return returns_of(nonmatching.make(), policy, 180)
 
-    best, forgetful = play(True), play(False)
-    assert best.min() >= 66, "six whole trials in 12 seconds; a search finds seven, worth 77"
-    assert forgetful.mean() < 25
-    assert returns_of(nonmatching.make(), at_random, 180).mean() < 5
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "best"), [("rooms/select_nonmatching_object", 77), (SMALL_NONMATCHING, 160)])
+def test_memory_is_worth_much_in_nonmatching(name, best, whole_compilation):
+    steps = names.default_steps(name)
+    play = lambda player: returns_of(tasks.game(name), player, steps)
+    assert play(players.scripted(name)).min() >= best
+    assert play(players.scripted(name, remembers=False)).mean() < best / 3
+    assert play(players.RANDOM).mean() < best / 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "frames"), [("rooms/select_nonmatching_object", (52, 47)), (SMALL_NONMATCHING, (16, 24))]
+)
+def test_a_plan_takes_as_few_frames_as_a_wide_search(name, frames, whole_compilation):
+    """Walking and strafing in turns, a player is faster than its speed, and lands sideways out of the teleport."""
+    at = nonmatching.places(tasks.NONMATCHING[name])
+    choice, solids = jnp.asarray(at.choices)[0], nonmatching.solids(at)
+    standing = movement.standing(jnp.asarray(at.start), jnp.zeros(()))
+    launched = movement.standing(jnp.asarray(at.exit), jnp.zeros(()))._replace(
+        velocity=jnp.array([nonmatching.LAUNCH, 0.0]), loose=jnp.asarray(nonmatching.AIRBORNE, jnp.int32)
+    )
+    legs = [
+        (standing, jnp.asarray(at.pad), partial(nonmatching.touches_pad, at)),
+        (launched, choice - jnp.array([44.0, 33.0]), lambda place: movement.within_reach(place, choice[None])[0]),
+    ]
+    walk = jax.jit(lambda body, action: players.walked(body, action, solids, 4))
+    for (body, goal, arrived), most in zip(legs, frames, strict=True):
+        found = jax.jit(partial(players.plan, arrived=arrived))(body, solids, goal)
+        taken = []
+        for action in np.asarray(found.actions)[: int(found.length)]:
+            body, positions = walk(body, jnp.asarray(action))
+            taken += [bool(arrived(place)) for place in positions]
+        assert taken.index(True) + 1 <= most
+        assert len(taken) - 4 <= taken.index(True), "the plan ends in the step in which it arrives"
+
+
+def test_a_random_player_of_the_small_nonmatching_meets_rewards_often():
+    """And memory is worth much there: a learner has something to begin with, and something to gain."""
+    game, returns, met = tasks.game(SMALL_NONMATCHING), [], []
+    env = base.from_core(make_core(game, 120, 8)._replace(observe=lambda s: {"image": jnp.zeros((8, 8, 3), jnp.uint8)}))
+    state = jax.vmap(env.prepare)(jax.random.split(jax.random.key(0), 64))
+    step = jax.jit(jax.vmap(env.step))
+    for key in jax.random.split(jax.random.key(1), 121):
+        state, timestep = step(state, jax.random.randint(key, (64,), 0, 9, jnp.int32))
+        returns.append(np.asarray(timestep.reward))
+    met = (np.array(returns) != 0).sum(0)
+    assert met.mean() > 5
+    assert np.median(met) >= 3
+    assert abs(np.sum(returns, axis=0).mean()) < 15
+
+
+def test_nobody_leaves_the_small_rooms():
+    """The player fits in where it starts and lands, and walls hold it."""
+    at = nonmatching.places(tasks.NONMATCHING[SMALL_NONMATCHING])
+    held = lambda place, room: all(room[2 * i] + 14.9 <= place[i] <= room[2 * i + 1] - 14.9 for i in (0, 1))
+    gap = (at.vestibule[0], at.room_2[1], *at.vestibule[2:])
+    far = jax.jit(lambda body: players.walked(body, jnp.asarray(0), nonmatching.solids(at), 100)[0].position)
+    for start, rooms in ((at.start, [at.room_1]), (at.exit, [at.vestibule, at.room_2, gap])):
+        assert held(start, rooms[0])
+        for yaw in np.linspace(-3, 3, 9):
+            end = np.asarray(far(movement.standing(jnp.asarray(start), jnp.float32(yaw))))
+            assert any(held(end, room) for room in rooms), (start, yaw, end)
 
 
 @pytest.mark.parametrize(
-    ("scale", "steps", "gap"), [(tasks.SMALL, 300, 2.0), pytest.param(1.0, 900, 1.5, marks=pytest.mark.slow)]
+    ("name", "gap"), [("rooms/watermaze_small", 2.0), pytest.param("rooms/watermaze", 1.5, marks=pytest.mark.slow)]
 )
-def test_memory_is_worth_much_in_the_watermaze(scale, steps, gap):
-    radius = scale * watermaze.DISC
+def test_memory_is_worth_much_in_the_watermaze(name, gap):
     play = lambda remembers: returns_of(
-        watermaze.make(scale), lambda s, m, k: players.swims(s, m, remembers, radius, k), steps, 64, players.NO_MEMORY
+        tasks.game(name), players.scripted(name, remembers), names.default_steps(name), 64
     )
     best, forgetful = play(True), play(False)
     assert best.mean() > gap * forgetful.mean(), (best.mean(), forgetful.mean())

@@ -39,9 +39,13 @@ class Collect(NamedTuple):
     taken: pickups.Taken
 
 
+def solids() -> Solids:
+    """The walls."""
+    return Solids(jnp.asarray(layout.around(ROOM), jnp.float32), jnp.ones((4,), bool), jnp.zeros((0, 3), jnp.float32))
+
+
 def make(configs: np.ndarray) -> Game:
     """The task with one of these configurations in each episode."""
-    solids = Solids(jnp.asarray(layout.around(ROOM), jnp.float32), jnp.ones((4,), bool), jnp.zeros((0, 3), jnp.float32))
     values = jnp.asarray([-1.0] * 10 + [1.0] * 10, jnp.float32)
 
     def begin(key: Array) -> tuple[Body, Collect]:
@@ -52,7 +56,7 @@ def make(configs: np.ndarray) -> Game:
         return standing(points[20], any_yaw(yaw_key)), task
 
     def frame(body: Body, task: Collect, controls: Array, clock: Array, key: Array) -> Frame:
-        body = walk(body, controls, solids)
+        body = walk(body, controls, solids())
         taken, now = pickups.take(task.taken, body.position, task.items, clock)
         reward = jnp.sum(jnp.where(now, values, 0.0))
         return Frame(body, task._replace(taken=taken), reward, pickups.over(taken, clock))

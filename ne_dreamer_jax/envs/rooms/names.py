@@ -9,6 +9,7 @@ NATIVE_STEPS = {
     "rooms/exploit_deferred_effects": 900,
     "rooms/exploit_deferred_effects_test": 900,
     "rooms/select_nonmatching_object": 180,
+    "rooms/select_nonmatching_object_small": 120,
     "rooms/watermaze": 1800,
     "rooms/watermaze_small": 300,
 }

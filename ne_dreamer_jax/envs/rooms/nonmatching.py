@@ -13,14 +13,7 @@ from ne_dreamer_jax.envs.rooms.game import Frame, Game
 from ne_dreamer_jax.envs.rooms.movement import Body, Solids, standing, walk, within_reach
 from ne_dreamer_jax.types import Array
 
-ROOM_1 = (-256.0, 128.0, -256.0, 128.0)
-VESTIBULE, ROOM_2 = (256.0, 376.0, -128.0, 0.0), (384.0, 640.0, -248.0, 128.0)
-FENCES = ((0.0, 80.0, 24.0, 104.0), (0.0, 80.0, -232.0, -152.0))  # not seen; they keep the player off the examples
 HEIGHT = 128.0
-START, EXIT = (-232.0, -64.0), (288.0, -64.0)
-PAD = (25.0, 103.0, -103.0, -25.0)  # where a player's centre touches it
-EXAMPLES = np.array([(40, 64), (40, -192)], np.float32)
-CHOICES = np.array([(600, 64), (600, -192)], np.float32)
 LAUNCH = 400.0  # units a second, out of the teleport
 AIRBORNE = 16  # frames until the feet are on the ground again
 
@@ -50,6 +43,53 @@ OBJECTS = len(SHAPES) * len(GLOWS)
 BODY = (41.0, 41.0, 41.0)
 
 
+class Places(NamedTuple):
+    """Where things are; rectangles are x from, x to, y from, y to."""
+
+    room_1: layout.Rectangle
+    start: np.ndarray  # float32 [2]
+    pad: np.ndarray  # float32 [2], its centre; a player's touches it less than `PAD_REACH` away along both axes
+    examples: np.ndarray  # float32 [2, 2]
+    fences: tuple[layout.Rectangle, ...]  # not seen; they keep the player off the examples
+    vestibule: layout.Rectangle
+    exit: np.ndarray  # float32 [2], of the teleport
+    room_2: layout.Rectangle
+    choices: np.ndarray  # float32 [2, 2]
+
+
+PAD_REACH = 39.0
+
+
+def places(scale: float = 1.0) -> Places:
+    """DMLab's two rooms, or ``scale`` times their size.
+
+    The first one shrinks towards the pad, the second towards the teleport's exit; the player, what it reaches, its
+    distance from the walls behind it, the pad and the objects keep their sizes.
+    """
+    pad, exit_ = (64.0, -64.0), (288.0, -64.0)
+    shrink = lambda about, *point: tuple(a + scale * (x - a) for a, x in zip(about, point, strict=True))
+    box = lambda about, *room: shrink((about[0], about[0], about[1], about[1]), *room)
+    points = lambda about, *rows: np.array([shrink(about, *row) for row in rows], np.float32)
+    room_1 = box(pad, -256.0, 128.0, -256.0, 128.0)
+    examples, side = points(pad, (40.0, 64.0), (40.0, -192.0)), 40.0 * scale
+    return Places(
+        room_1,
+        np.array((room_1[0] + 24.0, pad[1]), np.float32),
+        np.array(pad, np.float32),
+        examples,
+        tuple((float(x) - side, float(x) + side, float(y) - side, float(y) + side) for x, y in examples),
+        (exit_[0] - 32.0, *box(exit_, 256.0, 376.0, -128.0, 0.0)[1:]),
+        np.array(exit_, np.float32),
+        box(exit_, 384.0, 640.0, -248.0, 128.0),
+        points(exit_, (600.0, 64.0), (600.0, -192.0)),
+    )
+
+
+def touches_pad(at: Places, position: Array) -> Array:
+    """Whether a player at ``position`` [2] is teleported, bool []."""
+    return (jnp.abs(position - jnp.asarray(at.pad)) < PAD_REACH).all()
+
+
 class Nonmatching(NamedTuple):
     """One map: drawn anew each time that the player comes back to the first room."""
 
@@ -66,33 +106,35 @@ def _new_map(match: Array, key: Array) -> Nonmatching:
     return Nonmatching(match, other + (other >= match).astype(jnp.int32), coin(example_key), coin(place_key))
 
 
-def make() -> Game:
-    """The task."""
-    x0, x1, y0, y1 = VESTIBULE
+def solids(at: Places) -> Solids:
+    """What stops a player."""
+    (x0, x1, y0, y1), (c0, c1, b0, b1) = at.vestibule, at.room_2
+    t = 40.0
     boxes = [
-        *layout.around(ROOM_1), *FENCES,
-        (x0 - 40, x0, y0 - 40, y1 + 40), (x0 - 40, x1, y0 - 40, y0), (x0 - 40, x1, y1, y1 + 40),
-        (376.0, 384.0, ROOM_2[2] - 40, y0), (376.0, 384.0, y1, ROOM_2[3] + 40),
-        (ROOM_2[1], ROOM_2[1] + 40, ROOM_2[2] - 40, ROOM_2[3] + 40),
-        (376.0, ROOM_2[1] + 40, ROOM_2[2] - 40, ROOM_2[2]), (376.0, ROOM_2[1] + 40, ROOM_2[3], ROOM_2[3] + 40),
+        *layout.around(at.room_1), *at.fences,
+        (x0 - t, x0, y0 - t, y1 + t), (x0 - t, x1, y0 - t, y0), (x0 - t, x1, y1, y1 + t),
+        (x1, c0, b0 - t, y0), (x1, c0, y1, b1 + t),
+        (c1, c1 + t, b0 - t, b1 + t), (x1, c1 + t, b0 - t, b0), (x1, c1 + t, b1, b1 + t),
     ]  # fmt: skip
-    solids = Solids(jnp.asarray(boxes, jnp.float32), jnp.ones((len(boxes),), bool), jnp.zeros((0, 3), jnp.float32))
-    gap = ROOM_2[0]
-    ends = np.concatenate(
-        [
-            layout.inside(ROOM_1),
-            np.array(
-                [
-                    (x0, y0, gap, y0), (gap, y1, x0, y1), (x0, y1, x0, y0),
-                    (gap, y0, gap, ROOM_2[2]), (gap, ROOM_2[3], gap, y1),
-                    (gap, ROOM_2[2], ROOM_2[1], ROOM_2[2]), (ROOM_2[1], ROOM_2[2], ROOM_2[1], ROOM_2[3]),
-                    (ROOM_2[1], ROOM_2[3], gap, ROOM_2[3]),
-                ],
-                np.float32,
-            ),
-        ]
-    )  # fmt: skip
-    start, exit_ = jnp.asarray(START, jnp.float32), jnp.asarray(EXIT, jnp.float32)
+    return Solids(jnp.asarray(boxes, jnp.float32), jnp.ones((len(boxes),), bool), jnp.zeros((0, 3), jnp.float32))
+
+
+def _faces(at: Places) -> np.ndarray:
+    """What is seen of the walls, float32 [S, 4]."""
+    (x0, _, y0, y1), (c0, c1, b0, b1) = at.vestibule, at.room_2
+    rows = [
+        (x0, y0, c0, y0), (c0, y1, x0, y1), (x0, y1, x0, y0), (c0, y0, c0, b0), (c0, b1, c0, y1),
+        (c0, b0, c1, b0), (c1, b0, c1, b1), (c1, b1, c0, b1),
+    ]  # fmt: skip
+    return np.concatenate([layout.inside(at.room_1), np.array(rows, np.float32)])
+
+
+def make(scale: float = 1.0) -> Game:
+    """The task, in rooms of DMLab's size or of ``scale`` times that."""
+    at = places(scale)
+    walls, ends = solids(at), _faces(at)
+    start, exit_ = jnp.asarray(at.start), jnp.asarray(at.exit)
+    pad, examples, choices = jnp.asarray(at.pad), jnp.asarray(at.examples), jnp.asarray(at.choices)
 
     def begin(key: Array) -> tuple[Body, Nonmatching]:
         match_key, map_key = jax.random.split(key)
@@ -100,14 +142,13 @@ def make() -> Game:
         return standing(start, jnp.zeros((), jnp.float32)), _new_map(match, map_key)
 
     def frame(body: Body, task: Nonmatching, controls: Array, clock: Array, key: Array) -> Frame:
-        body = walk(body, controls, solids)
-        x, y = body.position
-        on_pad = (x > PAD[0]) & (x < PAD[1]) & (y > PAD[2]) & (y < PAD[3])
+        body = walk(body, controls, walls)
+        on_pad = touches_pad(at, body.position)
         launched = Body(
             exit_, jnp.array([LAUNCH, 0.0], jnp.float32), jnp.zeros((), jnp.float32), jnp.full((), AIRBORNE, jnp.int32)
         )
         body = jax.tree.map(lambda a, b: jnp.where(on_pad, a, b), launched, body)
-        reached = within_reach(body.position, jnp.asarray(CHOICES))
+        reached = within_reach(body.position, choices)
         right, wrong = reached[task.place], reached[1 - task.place]
         chosen = right | wrong
         fresh = standing(start, jnp.zeros((), jnp.float32)), _new_map(task.match, key)
@@ -117,14 +158,12 @@ def make() -> Game:
 
     def scene(body: Body, task: Nonmatching, clock: Array) -> draw.Scene:
         ids = jnp.stack([task.match, task.match, task.other])
-        match_place = jnp.asarray(CHOICES)[1 - task.place]
-        places = jnp.stack([jnp.asarray(EXAMPLES)[task.example], match_place, jnp.asarray(CHOICES)[task.place]])
+        shown = jnp.stack([examples[task.example], choices[1 - task.place], choices[task.place], pad])
         shape, glow = ids // len(GLOWS), ids % len(GLOWS)
         pulse = 1.0 + 0.15 * jnp.sin(2 * jnp.pi * 0.2 * clock.astype(jnp.float32) / 60)
-        pad = jnp.array([[64.0, -64.0]])
         body_colour = 0.45 * jnp.asarray(GLOWS)[glow] + 0.3 * jnp.asarray(BODY)
         items = draw.Items(
-            jnp.concatenate([places, pad]), jnp.array([12.0, 12.0, 12.0, 0.0]),
+            shown, jnp.array([12.0, 12.0, 12.0, 0.0]),
             jnp.concatenate([1.5 * jnp.asarray(SIZES)[shape], jnp.array([[48.0, 10.0]])]),
             jnp.concatenate([shape, jnp.full((1,), 4, jnp.int32)]),
             jnp.concatenate([body_colour, jnp.array([[200.0, 220.0, 90.0]])]),
@@ -132,12 +171,12 @@ def make() -> Game:
             jnp.ones((4,), bool),
         )  # fmt: skip
         count = len(ends)
-        walls = draw.Walls(
+        faces = draw.Walls(
             jnp.asarray(ends), jnp.full((count, 3), 1.0, jnp.float32) * jnp.array([[70.0, 105.0, 170.0]]),
             jnp.zeros((count,), jnp.float32), jnp.ones((count,), bool),
         )  # fmt: skip
         return draw.Scene(
-            walls, items, None, jnp.array([211.0, 146.0, 27.0]), jnp.array([150.0, 200.0, 235.0]), jnp.float32(HEIGHT),
+            faces, items, None, jnp.array([211.0, 146.0, 27.0]), jnp.array([150.0, 200.0, 235.0]), jnp.float32(HEIGHT),
             jnp.float32(50.0), jnp.zeros((4,), jnp.float32),
         )  # fmt: skip
 

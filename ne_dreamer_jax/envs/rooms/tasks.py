@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 from ne_dreamer_jax.envs import base
@@ -10,20 +12,22 @@ from ne_dreamer_jax.envs.rooms.game import Game, make_core
 from ne_dreamer_jax.envs.rooms.names import NAMES, NATIVE_STEPS, default_steps
 from ne_dreamer_jax.settings.text import did_you_mean
 
-SMALL = 0.42
-"""Size of the small watermaze's arena: 2 to 3 seconds from side to side."""
+COLLECT = {"rooms/collect_good_objects": collect.TRAIN, "rooms/collect_good_objects_test": collect.TEST}
+DEFERRED = {"rooms/exploit_deferred_effects": deferred.TRAIN, "rooms/exploit_deferred_effects_test": deferred.TEST}
+"""Task -> its configurations."""
+NONMATCHING = {"rooms/select_nonmatching_object": 1.0, "rooms/select_nonmatching_object_small": 0.36}
+"""Task -> the size of its rooms. A random player of the small one comes to a choice four times in an episode."""
+WATERMAZE = {"rooms/watermaze": 1.0, "rooms/watermaze_small": 0.42}
+"""Task -> the size of its arena. In the small one it is 2 to 3 seconds from side to side."""
 
 
 def game(name: str) -> Game:
     """The task's rules and looks. Raises ValueError for a name that is none."""
-    makers = {
-        "rooms/collect_good_objects": lambda: collect.make(collect.TRAIN),
-        "rooms/collect_good_objects_test": lambda: collect.make(collect.TEST),
-        "rooms/exploit_deferred_effects": lambda: deferred.make(deferred.TRAIN),
-        "rooms/exploit_deferred_effects_test": lambda: deferred.make(deferred.TEST),
-        "rooms/select_nonmatching_object": nonmatching.make,
-        "rooms/watermaze": watermaze.make,
-        "rooms/watermaze_small": lambda: watermaze.make(SMALL),
+    makers: dict[str, Callable[[], Game]] = {
+        **{name: partial(collect.make, configs) for name, configs in COLLECT.items()},
+        **{name: partial(deferred.make, configs) for name, configs in DEFERRED.items()},
+        **{name: partial(nonmatching.make, scale) for name, scale in NONMATCHING.items()},
+        **{name: partial(watermaze.make, scale) for name, scale in WATERMAZE.items()},
     }
     if name not in makers:
         raise ValueError(f"no Rooms task is called {name!r}. {did_you_mean(name, NAMES)}")
