@@ -95,11 +95,30 @@ def evaluate(
       ValueError: as `load`; or the other environment is observed or acted in otherwise.
     """
     loaded = load(run, env, prefer)
-    other = None if also is None else _other(also, loaded)
+    venv, other = as_vector(loaded.env), None
+    try:
+        other = None if also is None else _other(also, loaded)
+        return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+    finally:
+        for used in (venv, other):
+            if used is not None and used.host is not None:
+                used.host.close()
+
+
+def _evaluate(
+    path: Path,
+    loaded: Loaded,
+    venv: VectorEnv,
+    other: VectorEnv | None,
+    also: str | None,
+    episodes: int,
+    seed: int,
+    with_video: bool,
+    echo: Callable[[str], None],
+) -> dict[str, Any]:
     content = head(loaded, episodes, seed, echo)
-    venv = as_vector(loaded.env)
     play = make_play(venv, loaded.agent, loaded.config.loop.eval_max_steps)
-    files = RunDirectory(Path(run))
+    files = RunDirectory(path)
     for name, key in keys(seed).items():
         evaluation = play(loaded.state.params, key, episodes, random=name == "random", frames=with_video)
         content[name] = summary(evaluation)
@@ -109,9 +128,6 @@ def evaluate(
     if also is not None and other is not None:
         content["also"] = {"task": also} | _play_also(also, other, loaded, episodes, seed, echo)
     run_directory.write_evaluation(files, content)
-    for used in (venv, other):
-        if used is not None and used.host is not None:
-            used.host.close()
     return content
 
 
@@ -120,6 +136,8 @@ def _other(task: str, loaded: Loaded) -> VectorEnv:
     env = as_vector(env_configs.make(env_configs.for_task(task, loaded.config.env)))
     for what, expected, got in zip(("observations", "actions"), loaded.agent.spec, env.spec, strict=True):
         if expected != got:
+            if env.host is not None:
+                env.host.close()
             raise ValueError(f"{task}: expected the {what} of {loaded.config.env.task}, {expected}, got {got}")
     return env
 

@@ -280,6 +280,10 @@ class Pools:
         Raises:
           HostEnvError: the environment can't be made, or an agent can't see it or act in it; the message says why.
         """
+        self.workers = workers or Workers()
+        self._lock = threading.RLock()
+        self._pools: dict[int, Pool] = {}
+        self._idle: list[Pool] = []
         try:
             import cloudpickle
         except ImportError as error:
@@ -287,11 +291,7 @@ class Pools:
                 "environments in worker processes need the package cloudpickle; install it with: pip install "
                 "'ne-dreamer-jax[host]'"
             ) from error
-        self.workers = workers or Workers()
         self._factory = cloudpickle.dumps(factory)
-        self._lock = threading.RLock()
-        self._pools: dict[int, Pool] = {}
-        self._idle: list[Pool] = []
         self._lines: list[str] = []
         self.failure: str | None = None
         """Why environments were given up, where they were."""
@@ -300,6 +300,10 @@ class Pools:
         self._looked_at = self._make(1)
         self.described = self._looked_at.described
         self._idle.append(self._looked_at)
+
+    def __del__(self) -> None:
+        """Ends the workers of environments that nobody can step any more."""
+        self.close()
 
     def open(self, seeds: Sequence[int]) -> int:
         """The number of a pool with as many environments, of which the next steps begin seeded episodes."""
