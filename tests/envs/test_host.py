@@ -429,6 +429,7 @@ def test_beginning_a_step_early_changes_nothing():
     for _ in range(8):
         state, timestep = step(state, jnp.ones(4, jnp.int32))
         seen.append(jax.device_get(timestep))
+    env.release(state)  # with a step begun that nobody has waited for
     late = play(env, 8, action=jnp.ones(4, jnp.int32))[1]
     jax.tree.map(np.testing.assert_array_equal, seen, late)
 

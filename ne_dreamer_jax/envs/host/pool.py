@@ -150,6 +150,7 @@ class Pool:
         self._seeds = np.zeros(n, np.uint64)
         self.started: int | None = None
         """The number of the step that workers were last asked for."""
+        self._asked = False  # whether they have not been heard since
         self._workers = [self._start(i) for i in range(count)]
         for worker in self._workers:
             self.described = self._described(worker)
@@ -165,7 +166,7 @@ class Pool:
         """Asks for step ``number``, if that has not been done; environments to ``restart`` begin an episode instead."""
         if self.started == number:
             return
-        self.started = number
+        self.started, self._asked = number, True
         what = np.where(restart, BEGIN, np.where(self._gone, NOTHING, STEP)).astype(np.int8)
         self._gone[:] = False
         for worker, share in zip(self._workers, self._shares, strict=True):
@@ -188,12 +189,20 @@ class Pool:
                 self._replace(i, answer)
                 answer = [answer] * (share.stop - share.start)
             answers += answer
+        self._asked = False
         for i, first in enumerate(restart):
             answers[i] = self._counted(i, answers[i])
             while first and isinstance(answers[i], Lost):  # what has not begun can't be cut
                 answers[i] = self._counted(i, self._begin(i, actions))
             self._note(i, answers[i])
         return answers
+
+    def settle(self) -> None:
+        """Hears out what workers were asked for, so that the next answer is that to the next question."""
+        if self._asked:
+            nobody = np.zeros(self.n, bool)
+            with contextlib.suppress(HostEnvError):  # which the next step would find, too
+                self.finish(np.zeros(self.n), nobody)
 
     def close(self) -> None:
         """Ends all workers."""
@@ -333,6 +342,7 @@ class Pools:
         with self._lock:
             pool = self._pools.pop(number, None)
             if pool is not None:
+                pool.settle()
                 self._idle.append(pool)
 
     def lines(self) -> list[str]:
