@@ -81,7 +81,11 @@ def make(config: LoopConfig, env: Any, agent: Agent, action_repeat: int, mesh: M
         raise ValueError("expected one device for environments in worker processes; leave out --devices and a mesh")
     budget = Budget.of(config, agent.config.batch_size, agent.config.batch_length, action_repeat)
     if config.storage == "host":
-        _check_host()
+        if jax.process_count() > 1:
+            raise ValueError("loop.storage: expected 'pixels' or 'states' for several processes, got 'host'.")
+        _check_cpu("loop.storage: 'host' needs")
+    if venv.host is not None:
+        _check_cpu("environments in worker processes need")
     storage = storages.make(
         config.storage, agent.spec, venv.pictures, budget.capacity // budget.num_envs, config.num_envs
     )
@@ -249,16 +253,14 @@ def over_seeds(
     return init, jax.jit(jax.vmap(loop.chunk, in_axes=(axes, None), out_axes=(axes, 0)), donate_argnums=0)
 
 
-def _check_host() -> None:
-    """Raises ValueError where images can't be kept on the host."""
-    if jax.process_count() > 1:
-        raise ValueError("loop.storage: expected 'pixels' or 'states' for several processes, got 'host'.")
+def _check_cpu(what: str) -> None:
+    """Raises ValueError where compiled programs can't call back to the host."""
     try:
         jax.local_devices(backend="cpu")
     except RuntimeError as error:
         raise ValueError(
-            "loop.storage: 'host' needs JAX's cpu platform beside the accelerator's; expected both in JAX_PLATFORMS, "
-            f"such as 'cuda,cpu', got {os.environ.get('JAX_PLATFORMS', '')!r}."
+            f"{what} JAX's cpu platform beside the accelerator's; expected both in JAX_PLATFORMS, such as 'cuda,cpu', "
+            f"got {os.environ.get('JAX_PLATFORMS', '')!r}."
         ) from error
 
 

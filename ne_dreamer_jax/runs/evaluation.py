@@ -92,13 +92,20 @@ def evaluate(
       ``also`` holds the same of the other environment.
 
     Raises:
-      ValueError: as `load`; or the other environment is observed or acted in otherwise.
+      ValueError: as `load`; or the other environment is observed or acted in otherwise; or environments in worker
+        processes fail.
     """
     loaded = load(run, env, prefer)
     venv, other = as_vector(loaded.env), None
     try:
         other = None if also is None else _other(also, loaded)
         return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+    except jax.errors.JaxRuntimeError as error:
+        hosts = [used.host for used in (venv, other) if used is not None and used.host is not None]
+        failures = [host.failure for host in hosts if host.failure is not None]
+        if not failures:
+            raise
+        raise ValueError(f"the environments failed: {failures[0]}") from error
     finally:
         for used in (venv, other):
             if used is not None and used.host is not None:
@@ -126,6 +133,7 @@ def _evaluate(
         if with_video and name == "policy":
             _video(evaluation, files, venv.step_seconds, echo)
     if also is not None and other is not None:
+        run_directory.write_evaluation(files, content)  # whatever becomes of the other
         content["also"] = {"task": also} | _play_also(also, other, loaded, episodes, seed, echo)
     run_directory.write_evaluation(files, content)
     return content

@@ -150,7 +150,13 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
                 record.find("eval/return", counters) is None, record.random_return is None
             )
             if schedule.evaluates(step) and missing:
-                values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
+                try:
+                    values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
+                except jax.errors.JaxRuntimeError:
+                    if run.host is not None and run.host.failure is not None:  # what was learned is whole
+                        saves.whole(state, counters, None)
+                    raise
+                _tell(run, echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
                 if is_main_process:
@@ -174,8 +180,7 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
             echo(pace.line(before, counters, values, seconds))
             if int(state.counters.skipped) >= run.config.loop.max_skipped:
                 return _diverged(run, files, report, state, echo)
-            for line in run.host.lines() if run.host is not None else ():
-                echo(line)
+            _tell(run, echo)
             if run.host is not None and run.host.should_stop:
                 saves.whole(state, counters, record.score(counters))
                 echo(f"Stopped, as an environment failed (env.on_failure=stop). {_last(files)}")
@@ -370,6 +375,12 @@ def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, e
         "JAX_DEBUG_NANS=True to find the first operation."
     )
     return DIVERGED
+
+
+def _tell(run: Run, echo: Echo) -> None:
+    """Says what happened to environments on the host."""
+    for line in run.host.lines() if run.host is not None else ():
+        echo(line)
 
 
 def _last(files: RunDirectory) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import re
 import signal
@@ -372,6 +373,80 @@ def test_an_environment_that_never_begins_is_given_up():
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.block_until_ready(play(env, 1, KEYS[:1]))
     assert "no level found" in env.host.failure
+
+
+def test_an_environment_whose_episodes_all_begin_with_nan_is_given_up():
+    env = made(from_gymnasium(NanAtReset))
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        jax.block_until_ready(play(env, 20, KEYS[:1]))
+    assert "where each episode begins" in env.host.failure
+
+
+class NanAtReset(host_fakes.Counting):
+    """Its first observation is not finite."""
+
+    def _obs(self) -> Any:
+        return super()._obs() | ({"count": np.array([np.nan, 0.0])} if self.t == 0 else {})
+
+
+def test_a_state_is_stepped_once():
+    env = made(counting())
+    state = env.prepare(KEYS)
+    action = jnp.zeros(4, jnp.int32)
+    env.step(state, action)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="can't be stepped twice"):
+        jax.block_until_ready(env.step(state, action))
+
+
+def test_what_opens_once_only_is_named(tmp_path):
+    env = made(from_gymnasium(functools.partial(licensed, str(tmp_path / "taken"))))
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        jax.block_until_ready(env.prepare(KEYS))
+    assert "no licence is free" in env.host.failure
+
+
+def licensed(mark: str) -> Any:
+    if os.path.exists(mark):
+        raise OSError("no licence is free")
+    with open(mark, "w"):
+        return host_fakes.Counting()
+
+
+def test_workers_leave_signals_of_their_group_to_the_main_process():
+    env = made(counting(Workers(processes=1)))
+    state, _ = play(env, 2)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(children()[0], number)
+    state, timestep = env.step(state, jnp.zeros(4, jnp.int32))
+    assert timestep.obs["count"][:, 0].tolist() == [2, 2, 2, 2]
+
+
+def test_environments_that_nobody_holds_end():
+    env = counting(Workers(processes=1))
+    state, _ = play(env, 2)
+    env.release(state)
+    state = env.prepare(KEYS)
+    workers = children()
+    assert workers
+    del env, state
+    jax.clear_caches()  # of the steps, whose programs hold the environments as long as they are kept
+    gc.collect()
+    assert not set(children()) & set(workers)
+
+
+def test_a_second_beginning_compiles_nothing():
+    env, events = made(counting(Workers(processes=1))), []
+    env.release(env.prepare(KEYS))
+    listen = lambda name, *_, **__: events.append(name)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    compilations = lambda: sum("backend_compile" in name for name in events)
+    try:
+        env.prepare(KEYS)
+        assert compilations() == 0
+        env.prepare(KEYS[:3])
+        assert compilations() > 0  # of another number of environments: the listener hears them
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def test_what_can_not_be_made_is_refused():

@@ -26,7 +26,7 @@ LIBRARIES = {
     DM_ENV: Library("dm_env", "dm-env", "dm_env:mymodule:make"),
     DM_CONTROL: Library("dm_control", "'ne-dreamer-jax[train]'", "dm_control:walker_walk"),
     DMLAB: Library("deepmind_lab", "its own build, see github.com/google-deepmind/lab", "dmlab:rooms_watermaze"),
-    MEMORY_MAZE: Library("memory_maze", "memory-maze", "memory_maze:9x9"),
+    MEMORY_MAZE: Library("memory_maze", "memory-maze gym", "memory_maze:9x9"),
 }
 
 

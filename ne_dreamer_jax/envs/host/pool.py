@@ -26,6 +26,8 @@ START_SECONDS = 600.0
 FAILURES = 5
 """Of an environment, without an episode that ended or `STEPS` steps in between, after which it is given up."""
 STEPS = 1_000
+STARTS = 3
+"""Attempts to start a worker anew."""
 VARIABLE = "NE_DREAMER_WORKER"
 """Environment variable of workers that holds their number in their pool, from 0."""
 _MAIN = "from ne_dreamer_jax.envs.host.worker import main; main()"
@@ -106,12 +108,11 @@ class Worker:
     def close(self, seconds: float = 5.0) -> None:
         """Asks it to end, and ends it where it does not."""
         self.connection.close()
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
+        with contextlib.suppress(ProcessLookupError):  # what it started is in its group, and may outlive it
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
 
 
 class _Pickled:
@@ -145,6 +146,7 @@ class Pool:
         self._shares = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
         self._failures = np.zeros(n, int)
         self._steps = np.zeros(n, int)  # since the last failure
+        self._faults = np.zeros(n, int)  # episodes in a row that began with a number that was not finite
         self._gone = np.zeros(n, bool)  # what became of the episode with its worker, and is still to be told
         self._restarts = np.zeros(n, int)
         self._seeds = np.zeros(n, np.uint64)
@@ -164,7 +166,7 @@ class Pool:
 
     def start(self, number: int, actions: np.ndarray, restart: np.ndarray) -> None:
         """Asks for step ``number``, if that has not been done; environments to ``restart`` begin an episode instead."""
-        if self.started == number:
+        if self.started is not None and number <= self.started:
             return
         self.started, self._asked = number, True
         what = np.where(restart, BEGIN, np.where(self._gone, NOTHING, STEP)).astype(np.int8)
@@ -181,28 +183,34 @@ class Pool:
         Raises:
           HostEnvError: an environment fails again and again.
         """
+        if not self._asked:
+            raise HostEnvError(
+                "expected the state that the last step returned: environments in worker processes can't be stepped "
+                "twice from one"
+            )
         deadline = time.monotonic() + self._options.step_seconds
         answers: list[Any] = []
+        gone: list[int] = []
         for i, share in enumerate(self._shares):
             answer = self._workers[i].receive(self._options.step_seconds, deadline)
             if isinstance(answer, Lost):
-                self._replace(i, answer)
+                gone.append(i)
+                self._report(f"{answer.why}; it is started anew, and its episodes are cut.")
                 answer = [answer] * (share.stop - share.start)
             answers += answer
+        self._replace(gone)
         self._asked = False
         for i, first in enumerate(restart):
-            answers[i] = self._counted(i, answers[i])
+            answers[i] = self._counted(i, answers[i], first)
             while first and isinstance(answers[i], Lost):  # what has not begun can't be cut
-                answers[i] = self._counted(i, self._begin(i, actions))
+                answers[i] = self._counted(i, self._begin(i, actions), first)
             self._note(i, answers[i])
         return answers
 
     def settle(self) -> None:
         """Hears out what workers were asked for, so that the next answer is that to the next question."""
         if self._asked:
-            nobody = np.zeros(self.n, bool)
-            with contextlib.suppress(HostEnvError):  # which the next step would find, too
-                self.finish(np.zeros(self.n), nobody)
+            self.finish(np.zeros(self.n), np.zeros(self.n, bool))
 
     def close(self) -> None:
         """Ends all workers."""
@@ -223,25 +231,44 @@ class Pool:
         self.close()
         raise HostEnvError(answer.error if isinstance(answer, Failed) else answer.why)
 
-    def _replace(self, i: int, lost: Lost) -> None:
-        """Starts a worker in place of one that is gone."""
-        self._report(f"{lost.why}; it is started anew, and its episodes are cut.")
-        share = self._shares[i]
-        self._workers[i].close(0.0)
-        self._workers[i] = self._start(i)
-        self._described(self._workers[i])
-        self._restarts[share] += 1
-        self._gone[share] = True
-        seeds = [_seed(seed, number) for seed, number in zip(self._seeds[share], self._restarts[share], strict=True)]
-        self._workers[i].send(Seed(seeds))
+    def _replace(self, gone: Sequence[int]) -> None:
+        """Starts workers in place of those that are gone, all at the same time.
 
-    def _counted(self, i: int, answer: Stepped | Failed | Lost | None) -> Stepped | Lost:
-        """Reports and counts what an environment failed at."""
+        Raises:
+          HostEnvError: one can't be started in `STARTS` attempts.
+        """
+        for i in gone:
+            self._workers[i].close(0.0)
+            self._workers[i] = self._start(i)
+        for i in gone:
+            for attempt in range(STARTS):
+                answer = self._workers[i].receive(START_SECONDS)
+                if isinstance(answer, Described):
+                    break
+                if attempt == STARTS - 1:
+                    self.close()
+                    raise HostEnvError(answer.error if isinstance(answer, Failed) else answer.why)
+                time.sleep(attempt + 1.0)
+                self._workers[i].close(0.0)
+                self._workers[i] = self._start(i)
+            share = self._shares[i]
+            self._restarts[share] += 1
+            self._gone[share] = True
+            numbers = zip(self._seeds[share], self._restarts[share], strict=True)
+            self._workers[i].send(Seed([_seed(seed, number) for seed, number in numbers]))
+
+    def _counted(self, i: int, answer: Stepped | Failed | Lost | None, first: bool) -> Stepped | Lost:
+        """Reports and counts what an environment failed at, on the ``first`` step of an episode or later."""
         if answer is None:
             return Lost("its worker was started anew")
         if isinstance(answer, Stepped):
             if answer.fault:
                 self._report(f"environment {i}: {answer.fault}; its episode is cut.")
+                self._faults[i] = self._faults[i] + 1 if first else 0
+                if self._faults[i] > FAILURES:
+                    raise HostEnvError(f"environment {i}: {answer.fault}, where each episode begins")
+            elif first:
+                self._faults[i] = 0
             return answer
         why = answer.why if isinstance(answer, Lost) else f"environment {i} raised {answer.error}"
         self._failures[i] += 1
@@ -267,7 +294,8 @@ class Pool:
         self._workers[j].send(Step(actions[share], what))
         answer = self._workers[j].receive(self._options.step_seconds)
         if isinstance(answer, Lost):
-            self._replace(j, answer)
+            self._report(f"{answer.why}; it is started anew, and its episodes are cut.")
+            self._replace([j])
             return answer
         self._gone[i] = False
         return answer[i - share.start]
@@ -316,6 +344,13 @@ class Pools:
 
     def open(self, seeds: Sequence[int]) -> int:
         """The number of a pool with as many environments, of which the next steps begin seeded episodes."""
+        try:
+            return self._open(seeds)
+        except HostEnvError as error:
+            self.failure = str(error)
+            raise
+
+    def _open(self, seeds: Sequence[int]) -> int:
         with self._lock:
             n = len(seeds)
             fitting = next((pool for pool in self._idle if pool.n == n), None)
@@ -342,8 +377,11 @@ class Pools:
         with self._lock:
             pool = self._pools.pop(number, None)
             if pool is not None:
-                pool.settle()
-                self._idle.append(pool)
+                try:
+                    pool.settle()
+                    self._idle.append(pool)
+                except HostEnvError:  # it could not be put right; the next is made anew
+                    pool.close()
 
     def lines(self) -> list[str]:
         """What happened since this was last asked."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -64,7 +65,7 @@ def host_env(factory: Callable[[], Player], workers: Workers | None = None) -> V
     spec = EnvSpec(observation, action)
     return VectorEnv(
         spec=spec,
-        prepare=partial(_prepare, pools, spec),
+        prepare=partial(_prepare, _opener(pools), spec),
         step=partial(_step, pools, spec),
         cuts=lambda state: Cuts(state.faults, state.bad_actions),
         step_seconds=described.step_seconds,
@@ -74,14 +75,26 @@ def host_env(factory: Callable[[], Player], workers: Workers | None = None) -> V
     )
 
 
-def _prepare(pools: Pools, spec: EnvSpec, keys: Array) -> HostState:
+def _opener(pools: Pools) -> Callable[[Any], np.ndarray]:
+    """The callback of `_prepare`: one and the same, since JAX keeps a program for each, and what it holds, for ever."""
+    there = weakref.ref(pools)
+
+    def opened(seeds: Any) -> np.ndarray:
+        found = there()
+        if found is None:
+            raise HostEnvError("the environments' workers have ended with the VectorEnv that they belonged to")
+        return np.asarray(found.open(np.asarray(seeds).tolist()), np.int32)
+
+    return opened
+
+
+def _prepare(opened: Callable[[Any], np.ndarray], spec: EnvSpec, keys: Array) -> HostState:
     """From keys [N]; the episodes begin with the first step."""
     n = keys.shape[0]
     seeds = jax.vmap(lambda key: jax.random.bits(key, (), jnp.uint32))(keys)
-    opened = io_callback(lambda seeds: np.int32(pools.open(np.asarray(seeds).tolist())), _int(), seeds)
     count = lambda: jnp.zeros((n,), jnp.int32)
     return HostState(
-        pool=opened,
+        pool=io_callback(opened, _int(), seeds),
         number=jnp.zeros((), jnp.int32),
         seeds=seeds,
         needs_reset=jnp.ones((n,), bool),
@@ -149,14 +162,15 @@ def _ask(
 ) -> _Answer:
     """A step of all environments, or their beginning where they are another process's."""
     action, restart, seeds = np.asarray(action), np.asarray(restart), np.asarray(seeds)
-    try:
-        pool, lost = pools.get(int(number_of_pool)), np.zeros(len(restart), bool)
-        if pool is None:
-            number_of_pool, lost = pools.open(_later(seeds, int(number))), ~restart
-            pool = pools.get(number_of_pool)
-            assert pool is not None
+    pool, lost = pools.get(int(number_of_pool)), np.zeros(len(restart), bool)
+    if pool is None:
+        number_of_pool, lost = pools.open(_later(seeds, int(number))), ~restart
+        pool = pools.get(number_of_pool)
+        assert pool is not None
+        if lost.any():
             pools.report(f"{lost.sum()} episodes of another process are cut; others begin.")
-            restart = np.ones_like(restart)
+        restart = np.ones_like(restart)
+    try:
         pool.start(int(number), action, restart)
         answers = pool.finish(action, restart)
     except HostEnvError as error:

@@ -171,7 +171,10 @@ def end_with(parent: int, seconds: float = 1.0) -> None:
 
 def main() -> None:
     """Serves the connection whose file descriptor is the argument."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to answer
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the main process's to answer, which saves first
+        signal.signal(number, signal.SIG_IGN)
+    descriptor = int(sys.argv[1])
+    os.set_inheritable(descriptor, False)  # simulators that an environment starts would keep the connection open
     end_with(os.getppid())
-    sys.stdout = sys.stderr  # what environments print is no output of the run
-    serve(Connection(int(sys.argv[1])))
+    os.dup2(2, 1)  # what environments print is no output of the run
+    serve(Connection(descriptor))
