@@ -15,6 +15,7 @@ from ne_dreamer_jax.system.quiet import quiet
 if TYPE_CHECKING:
     from ne_dreamer_jax.envs.base import Env
     from ne_dreamer_jax.envs.conformance import Finding
+    from ne_dreamer_jax.envs.vector import VectorEnv
 
 
 class Option(click.ParamType):
@@ -60,7 +61,7 @@ def inspect(
     name: str,
     options: dict[str, Any] | None = None,
     *,
-    resolve: Callable[..., Env] | None = None,
+    resolve: Callable[..., Env | VectorEnv] | None = None,
     echo: Callable[[str], None] = say,
     seed: int = 0,
     **sizes: int,
@@ -79,15 +80,20 @@ def inspect(
     import jax
 
     from ne_dreamer_jax.envs import conformance
+    from ne_dreamer_jax.envs.vector import VectorEnv
 
     env = (resolve or resolved)(name, **(options or {}))
     for key, spec in sorted(env.spec.observation.items()):
         echo(f"obs[{key!r}]: {jax.numpy.dtype(spec.dtype).name}{list(spec.shape)}")
     echo(f"action: {env.spec.action}")
-    return conformance.findings(env, jax.random.key(seed), echo=echo, **sizes)
+    try:
+        return conformance.findings(env, jax.random.key(seed), echo=echo, **sizes)
+    finally:
+        if isinstance(env, VectorEnv) and env.host is not None:
+            env.host.close()
 
 
-def resolved(name: str, **options: Any) -> Env:
+def resolved(name: str, **options: Any) -> Env | VectorEnv:
     """The environment called ``name``, of another library (``jax:...``) or of this package; errors as of theirs."""
     from ne_dreamer_jax import envs
 

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +50,7 @@ def test_the_readmes_gymnasium_environment_is_trained_in(tmp_path, monkeypatch):
     monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
     monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
     (code,) = blocks("### Environments of gymnasium and dm_env")
-    made = {"jax": jax}
+    made: dict[str, Any] = {}
     exec(compile(code, "README.md", "exec"), made)
     made["env"].host.close()
     assert made["env"].spec.observation["vector"].shape == (3,)

@@ -84,6 +84,7 @@ def test_a_failure_stops_the_run_where_that_is_chosen_and_the_run_goes_on_later(
     assert "2 episodes of another process are cut; others begin." in said
 
 
+@pytest.mark.slow
 def test_a_failure_costs_an_episode_where_the_run_is_to_go_on(tmp_path):
     env = from_gymnasium(
         functools.partial(host_fakes.Failing, "raises", str(tmp_path / "mark")), workers=Workers(processes=1)
@@ -94,6 +95,7 @@ def test_a_failure_costs_an_episode_where_the_run_is_to_go_on(tmp_path):
     assert sum("episodes cut by faults of the environment: 1" in line for line in said) == 1
 
 
+@pytest.mark.slow
 def test_environments_that_fail_again_and_again_end_the_run_with_a_sentence(tmp_path):
     env = from_gymnasium(functools.partial(host_fakes.Failing, "raises"), workers=Workers(processes=1))
     code, said = train(tmp_path / "run", env, eval_every=None)
