@@ -22,7 +22,7 @@ class Outcome(NamedTuple):
     files: RunDirectory
     """Where everything lies."""
     code: int
-    """0 when the run is finished, 128 + the signal's number when it was stopped by one."""
+    """0 when the run is finished, 128 + the signal's number when it was stopped by one, else as of `training.train`."""
 
 
 def train(

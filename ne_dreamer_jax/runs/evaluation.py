@@ -88,7 +88,8 @@ def evaluate(
 
     Returns:
       What ``evaluation.json`` holds: ``task``, ``env_step``, ``episodes``, ``seed``, and for ``policy`` and ``random``
-      the ``mean``, ``std``, ``returns`` and ``lengths``, and the number ``unfinished`` at ``loop.eval_max_steps``;
+      the ``mean``, ``std``, ``returns`` and ``lengths``, the number ``unfinished`` at ``loop.eval_max_steps`` and the
+      number ``cut`` by faults of the environment;
       ``also`` holds the same of the other environment.
 
     Raises:
@@ -129,6 +130,8 @@ def _evaluate(
     for name, key in keys(seed).items():
         evaluation = play(loaded.state.params, key, episodes, random=name == "random", frames=with_video)
         content[name] = summary(evaluation)
+        for told in venv.host.lines() if venv.host is not None else ():
+            echo(told)
         echo(line(name, evaluation))
         if with_video and name == "policy":
             _video(evaluation, files, venv.step_seconds, echo)
@@ -187,6 +190,7 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         "returns": [float(value) for value in returns],
         "lengths": [int(value) for value in evaluation.lengths],
         "unfinished": evaluation.unfinished,
+        "cut": int((~np.asarray(evaluation.complete)).sum()),
     }
 
 
@@ -200,6 +204,8 @@ def line(name: str, evaluation: Evaluation, where: str = "") -> str:
     """An evaluation in words."""
     returns = np.asarray(evaluation.returns, np.float64)
     open_end = f", {evaluation.unfinished} of them not ended" if evaluation.unfinished else ""
+    cut = int((~np.asarray(evaluation.complete)).sum())
+    open_end += f", {cut} of them CUT SHORT by faults of the environment or its actions" if cut else ""
     mean, deviation = mean_and_deviation(returns)
     return f"{name:7} return {mean:8.1f} ± {deviation:.1f} over {len(returns)} episodes{open_end}{where}"
 

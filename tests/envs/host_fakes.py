@@ -110,6 +110,15 @@ class Walk(dm_env.Environment):
         return {"t": np.int64(self.t), "phase": np.int32(self.t % 4)}
 
 
+class Stumbling(Walk):
+    """Raises at its third step."""
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        if self.t == 2:
+            raise RuntimeError("a stone")
+        return super().step(action)
+
+
 def make_walk() -> dm_env.Environment:
     """For ``dm_env:tests.envs.host_fakes:make_walk``."""
     return Walk()

@@ -389,6 +389,11 @@ class NanAtReset(host_fakes.Counting):
         return super()._obs() | ({"count": np.array([np.nan, 0.0])} if self.t == 0 else {})
 
 
+def test_one_environment_alone_is_refused_with_what_to_do():
+    with pytest.raises(ValueError, match=r"prepare: expected N keys, \[N\], got \[\]; .*without jax.vmap"):
+        jax.vmap(made(counting()).prepare)(KEYS)
+
+
 def test_a_state_is_stepped_once():
     env = made(counting())
     state = env.prepare(KEYS)

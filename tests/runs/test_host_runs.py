@@ -84,6 +84,18 @@ def test_a_failure_stops_the_run_where_that_is_chosen_and_the_run_goes_on_later(
     assert "2 episodes of another process are cut; others begin." in said
 
 
+def test_an_evaluation_says_which_episodes_were_cut(by_name, monkeypatch):
+    path, _ = by_name
+    env = from_dm_env(host_fakes.Stumbling)
+    monkeypatch.setattr("ne_dreamer_jax.runs.evaluation.env_configs.make", lambda config: env)
+    said: list[str] = []
+    result = nedreamer.evaluate(path, episodes=2, echo=said.append)
+    assert result["policy"]["cut"] == 2
+    assert result["policy"]["lengths"] == [3, 3]
+    assert any("2 of them CUT SHORT" in line for line in said)
+    assert any("a stone" in line for line in said)
+
+
 @pytest.mark.slow
 def test_a_failure_costs_an_episode_where_the_run_is_to_go_on(tmp_path):
     env = from_gymnasium(

@@ -90,6 +90,11 @@ def _opener(pools: Pools) -> Callable[[Any], np.ndarray]:
 
 def _prepare(opened: Callable[[Any], np.ndarray], spec: EnvSpec, keys: Array) -> HostState:
     """From keys [N]; the episodes begin with the first step."""
+    if keys.ndim != 1:
+        raise ValueError(
+            f"prepare: expected N keys, [N], got {list(keys.shape)}; environments in worker processes are N at once: "
+            "call prepare and step without jax.vmap"
+        )
     n = keys.shape[0]
     seeds = jax.vmap(lambda key: jax.random.bits(key, (), jnp.uint32))(keys)
     count = lambda: jnp.zeros((n,), jnp.int32)
