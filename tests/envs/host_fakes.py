@@ -111,12 +111,11 @@ class Walk(dm_env.Environment):
 
 
 class Stumbling(Walk):
-    """Raises at its third step."""
+    """The reward of its third step is not finite."""
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        if self.t == 2:
-            raise RuntimeError("a stone")
-        return super().step(action)
+        timestep = super().step(action)
+        return timestep._replace(reward=np.nan) if self.t == 3 else timestep
 
 
 def make_walk() -> dm_env.Environment:
