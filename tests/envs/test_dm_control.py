@@ -81,6 +81,7 @@ def test_without_opengl_the_message_says_what_to_install(monkeypatch):
             def render(*_, **__):
                 raise OSError("no such library")
 
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # to be put back
     monkeypatch.setattr(suite, "load", lambda *_, **__: Blind)
     with pytest.raises(ValueError, match="Install OSMesa"):
         factories.PLAYERS["dm_control:"]("pendulum_swingup", players.Options(observe="pixels"))

@@ -240,7 +240,9 @@ def made(env: VectorEnv) -> VectorEnv:
 
 
 def children() -> list[int]:
-    found = subprocess.run(["ps", "-o", "pid=,ppid=,args=", "-A"], capture_output=True, text=True, check=True).stdout
+    found = subprocess.run(
+        ["ps", "-ww", "-o", "pid=,ppid=,args=", "-A"], capture_output=True, text=True, check=True
+    ).stdout
     rows = [line.split(None, 2) for line in found.splitlines()]
     return [int(row[0]) for row in rows if int(row[1]) == os.getpid() and "host.worker" in row[2]]
 
