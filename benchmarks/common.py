@@ -13,7 +13,6 @@ A benchmark reads::
 from __future__ import annotations
 
 import json
-import os
 import platform
 import statistics
 import time
@@ -22,6 +21,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from ne_dreamer_jax.system import processors
 
 GEMM_SIZE = 2048
 Value = str | int | float | None
@@ -158,7 +159,7 @@ def machine() -> str:
     """One line: the devices that JAX computes on, the processor with the cores this process may use, and versions."""
     devices = jax.devices()
     kinds = f"{len(devices)} x {devices[0].device_kind}" if devices[0].platform != "cpu" else "CPU only"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = processors.available()
     return f"{kinds}, {_processor()} ({cores} cores), jax {jax.__version__}, Python {platform.python_version()}"
 
 

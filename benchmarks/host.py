@@ -29,7 +29,7 @@ def main(
     Of the workers' environments twice: stepped while the agent learns, as in training, and after it has learned.
     """
     quiet()
-    from benchmarks import common
+    from benchmarks import common, rollout
     from experiments.train import configure
     from ne_dreamer_jax.envs import config as env_configs
     from ne_dreamer_jax.envs.vector import as_vector
@@ -47,7 +47,7 @@ def main(
                 pools.append(env.host)
                 cases[f"workers, one after the other x {n}"] = _chunk(config, env._replace(start=None), steps)
             cases[f"{name} x {n}"] = _chunk(config, env, steps)
-            cases[f"{name}, acting alone x {n}"] = _rollout(env, n, steps)
+            cases[f"{name}, acting alone x {n}"] = rollout.rolled(env, n, steps)
             agent_steps |= dict.fromkeys(cases.keys() - agent_steps.keys(), n * steps)
     measured = common.measure(cases, rounds=rounds)
     columns: dict[str, dict[str, Any]] = {
@@ -86,29 +86,6 @@ def _chunk(config: Any, env: Any, steps: int) -> Callable[[], Any]:
         return go_on()
 
     return begin
-
-
-def _rollout(env: Any, n: int, steps: int) -> Callable[[], Any]:
-    """A function that goes on for some steps from where its last call left off."""
-    import jax
-
-    from ne_dreamer_jax.envs import conformance
-
-    held = {"state": env.prepare(jax.random.split(jax.random.key(0), n))}
-
-    @jax.jit
-    def roll(state: Any, key: Any) -> Any:
-        def step(state: Any, key: Any) -> Any:
-            state, timestep = env.step(state, conformance.random_action(env, key, n))
-            return state, timestep.reward
-
-        return jax.lax.scan(step, state, jax.random.split(key, steps))
-
-    def go_on() -> Any:
-        held["state"], rewards = roll(held["state"], jax.random.key(1))
-        return rewards
-
-    return go_on
 
 
 if __name__ == "__main__":

@@ -75,20 +75,26 @@ def main(
 
 
 def rollout(task: str, num_envs: int, steps: int, **options: Any) -> Callable[[], Any]:
-    """A function that goes on for some steps from where its last call left off. Its first call compiles it.
+    """`rolled` of an environment by name.
 
     Args:
       options: of the environment.
     """
+    return rolled(envs.make(task, **options), num_envs, steps)
+
+
+def rolled(env: Any, num_envs: int, steps: int) -> Callable[[], Any]:
+    """A function that goes on for some steps from where its last call left off. Its first call compiles it."""
     import jax
 
     from ne_dreamer_jax.envs import conformance
+    from ne_dreamer_jax.envs.vector import as_vector
 
-    env = envs.make(task, **options)
+    env = as_vector(env)
 
     def run(state: Any, key: jax.Array) -> tuple[Any, Any]:
         def step(state: Any, key: jax.Array) -> tuple[Any, Any]:
-            state, timestep = jax.vmap(env.step)(state, conformance.random_action(env, key, num_envs))
+            state, timestep = env.step(state, conformance.random_action(env, key, num_envs))
             seen = {name: value.astype("float32").sum() for name, value in timestep.obs.items()}
             return state, (timestep.reward, seen)
 
@@ -99,7 +105,7 @@ def rollout(task: str, num_envs: int, steps: int, **options: Any) -> Callable[[]
 
     def case() -> Any:
         if not held:
-            held.append(jax.jit(jax.vmap(env.prepare))(jax.random.split(jax.random.key(0), num_envs)))
+            held.append(jax.jit(env.prepare)(jax.random.split(jax.random.key(0), num_envs)))
         held[0], outputs = compiled(held[0], jax.random.key(1))
         return outputs
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Callable
 from typing import Any
@@ -81,8 +80,9 @@ def main(
 
 def start(python: str) -> list[subprocess.Popen[str]]:
     """A process with a Memory Maze for each core that this one may use, when all are ready."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    pipe = subprocess.PIPE
+    from ne_dreamer_jax.system import processors
+
+    cores, pipe = processors.available(), subprocess.PIPE
     workers = [subprocess.Popen([python, "-c", WORKER], stdin=pipe, stdout=pipe, text=True) for _ in range(cores)]
     for worker in workers:
         expect(worker, "ready")

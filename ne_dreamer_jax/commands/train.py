@@ -9,7 +9,7 @@ import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -153,35 +153,35 @@ def main(
             say(f"{path}={settings.as_text(value)}")
         return
     with interruptible():
-        _train(config, logdir, fork, checkpoint_minutes, devices, coordinator, processes, process)
+        _train(config, logdir, fork, checkpoint_minutes, Group(devices, coordinator, processes, process))
 
 
-def _train(
-    config: Config,
-    logdir: Path,
-    fork: Path | None,
-    checkpoint_minutes: float,
-    devices: int,
-    coordinator: str | None,
-    processes: int,
-    process: int,
-) -> None:
+class Group(NamedTuple):
+    """What trains together, as of the options of these names."""
+
+    devices: int
+    coordinator: str | None
+    processes: int
+    process: int
+
+
+def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: float, group: Group) -> None:
     """Trains, and ends the program with the run's exit code."""
     from ne_dreamer_jax.runs import checkpoint, progress, resume, training
     from ne_dreamer_jax.runs import fork as forks
     from ne_dreamer_jax.system import compile_cache, parallel
 
-    echo = say if process == 0 else lambda line: None
+    echo = say if group.process == 0 else lambda line: None
     with refusing(ValueError, run_directory.RefusedError):
         config = resume.settle(logdir, config)
         changed = resume.changes(logdir, config)
         if fork is not None:
             forks.check(fork, logdir)
-        if coordinator is not None:
-            parallel.connect(coordinator, processes, process)
+        if group.coordinator is not None:
+            parallel.connect(group.coordinator, group.processes, group.process)
         find_devices()
         kept = compile_cache.enable()
-        mesh = parallel.make_mesh(devices) if devices * processes > 1 else None
+        mesh = parallel.make_mesh(group.devices) if group.devices * group.processes > 1 else None
         run = training.build(config, mesh=mesh)
         if fork is not None:
             forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
@@ -189,7 +189,7 @@ def _train(
         echo(line)
     with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:
         files = run_directory.RunDirectory(logdir)
-        if process == 0:
+        if group.process == 0:
             files = stack.enter_context(run_directory.claim(logdir, config, resume.differences))
         code = training.train(run, files, checkpoint_minutes=checkpoint_minutes, echo=echo, parent=fork)
     raise SystemExit(code)

@@ -70,19 +70,12 @@ class JaxConfig:
         return 1
 
 
-@dataclass(frozen=True)
-class HostConfig:
-    """An environment of another library in worker processes, see `envs.host`."""
+@dataclass(frozen=True, kw_only=True)
+class WorkersConfig:
+    """Processes in which environments run, see `envs.host.Workers`; what is learned does not depend on them."""
 
-    task: str = "gym:CartPole-v1"
-    obs: Literal["own", "pixels", "both"] = "own"
-    """What it observes itself, a picture of it, or both."""
-    action_repeat: Repeat = 1
-    """Environment steps for which each action is held; rewards are summed."""
-    image_size: ImageSize = 64
-    """Height and width of images, to which others are scaled."""
     workers: Annotated[int, Range(1, 65_536)] | None = None
-    """Processes, at most one an environment; none: as many as there are processors."""
+    """At most one an environment; none: as many as there are processors."""
     step_seconds: Annotated[float, Range(0.001, 1e6)] = 60.0
     """What a step may take before its worker counts as hung."""
     on_failure: Literal["restart", "stop"] = "restart"
@@ -93,7 +86,20 @@ class HostConfig:
 
 
 @dataclass(frozen=True)
-class DmControlConfig:
+class HostConfig(WorkersConfig):
+    """An environment of another library in worker processes, see `envs.host`."""
+
+    task: str = "gym:CartPole-v1"
+    obs: Literal["own", "pixels", "both"] = "own"
+    """What it observes itself, a picture of it, or both."""
+    action_repeat: Repeat = 1
+    """Environment steps for which each action is held; rewards are summed."""
+    image_size: ImageSize = 64
+    """Height and width of images, to which others are scaled."""
+
+
+@dataclass(frozen=True)
+class DmControlConfig(WorkersConfig):
     """A task of dm_control itself, with C MuJoCo's physics and OpenGL pictures, in worker processes."""
 
     task: str = "dm_control:walker_walk"
@@ -103,15 +109,6 @@ class DmControlConfig:
     """Environment steps for which each action is held; rewards are summed."""
     image_size: ImageSize = 64
     """Height and width of the frames."""
-    workers: Annotated[int, Range(1, 65_536)] | None = None
-    """As of `HostConfig`."""
-    step_seconds: Annotated[float, Range(0.001, 1e6)] = 60.0
-    """As of `HostConfig`."""
-    on_failure: Literal["restart", "stop"] = "restart"
-    """As of `HostConfig`."""
-
-    def __post_init__(self) -> None:
-        ranges.check(self)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +13,7 @@ import numpy as np
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.rooms import movement, watermaze
 from ne_dreamer_jax.envs.rooms.game import Game, State
-from ne_dreamer_jax.files import replacing
-from ne_dreamer_jax.runs import video
+from ne_dreamer_jax.runs import plots, video
 from ne_dreamer_jax.types import Array, TimeStep
 
 Act = Callable[[TimeStep, State, Any, Array], tuple[Array, Any]]
@@ -87,7 +84,7 @@ def picture(seen: Seen, path: Path, title: str) -> None:
     """The whole path on the map, and frames of moments that are numbered there, as a PNG that is replaced whole."""
     length = len(seen.yaw)
     moments = _moments(seen)
-    with _figure(10.4, 3.9) as (figure, save):
+    with plots.figure(10.4, 3.9, dpi=110) as figure:
         grid = figure.add_gridspec(2, 6)
         axes = figure.add_subplot(grid[:, :2])
         _room(axes, seen, 0)
@@ -104,18 +101,18 @@ def picture(seen: Seen, path: Path, title: str) -> None:
             frame.imshow(seen.image[t], interpolation="nearest")
             frame.set_title(f"{number + 1}: step {t}", fontsize=7, pad=2)
             frame.set_axis_off()
-        save(path)
+        plots.save(figure, path)
 
 
 def film(seen: Seen, path: Path, title: str, fps: float) -> None:
     """The map and the frame of each step side by side, as an mp4; errors as of `video.write`."""
-    with _figure(6.4, 3.4, dpi=100) as (figure, _):
+    with plots.figure(6.4, 3.4, dpi=100) as figure:
         left, right = figure.subplots(1, 2)
         _room(left, seen, 0)
         right.set_axis_off()
         figure.suptitle(title, fontsize=8)
         left.set_title(" ", fontsize=8)
-        canvas = figure.canvas
+        canvas: Any = figure.canvas
         canvas.draw()
         figure.set_layout_engine("none")  # what follows moves nothing
         frames = []
@@ -199,25 +196,3 @@ def _path(seen: Seen, begin: int, end: int) -> np.ndarray:
     """Positions with gaps (NaN) where the player was carried, [.., 2]."""
     places = seen.position[begin:end]
     return np.insert(places, np.flatnonzero(_carried(seen)[begin:end]), np.nan, axis=0)
-
-
-@contextlib.contextmanager
-def _figure(width: float, height: float, dpi: int = 110) -> Iterator[tuple[Any, Callable[[Path], None]]]:
-    """An empty figure, drawn without a display, and what saves it as a PNG. Sides are in inches."""
-    backend = os.environ.pop("MPLBACKEND", None)
-    try:
-        import matplotlib.style
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    finally:
-        if backend is not None:
-            os.environ["MPLBACKEND"] = backend
-    with matplotlib.style.context("default"):
-        figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
-
-        def save(path: Path) -> None:
-            with replacing(path) as beside:
-                canvas.print_figure(beside, format="png")
-
-        yield figure, save

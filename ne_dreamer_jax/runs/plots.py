@@ -22,6 +22,7 @@ from ne_dreamer_jax.runs import metrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TRAIN, EVALUATION, RANDOM = "#0072b2", "#d55e00", "#666666"  # of the Okabe-Ito palette: apart for every eye
 METHODS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8b5a2b", "#999999", "#000000")
@@ -117,6 +118,14 @@ def _style(axes: Axes) -> None:
 @contextlib.contextmanager
 def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
     """Axes to draw on; at the end of the block the PNG is replaced whole. Sides are in inches of 150 pixels."""
+    with figure(width, height, dpi=150) as empty:
+        yield empty.subplots()
+        save(empty, path)
+
+
+@contextlib.contextmanager
+def figure(width: float, height: float, dpi: int) -> Iterator[Figure]:
+    """An empty figure in matplotlib's own style, drawn without a display. Sides are in inches."""
     backend = os.environ.pop("MPLBACKEND", None)
     try:
         import matplotlib.style
@@ -126,11 +135,15 @@ def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
         if backend is not None:
             os.environ["MPLBACKEND"] = backend
     with matplotlib.style.context("default"):
-        figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
-        yield figure.subplots()
-        with replacing(path) as beside:
-            canvas.print_figure(beside, format="png")
+        empty = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+        FigureCanvasAgg(empty)
+        yield empty
+
+
+def save(drawn: Figure, path: Path) -> None:
+    """Writes a figure as a PNG that is replaced whole."""
+    with replacing(path) as beside:
+        drawn.canvas.print_figure(beside, format="png")
 
 
 def _train(axes: Axes, steps: np.ndarray, returns: np.ndarray) -> None:

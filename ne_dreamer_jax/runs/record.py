@@ -22,6 +22,13 @@ def whole(frames: HostFrames | None) -> tuple[str, ...]:
     return ("agent", "loop") if frames is None else ("agent", "loop", "frames")
 
 
+def last(files: RunDirectory, frames: HostFrames | None) -> str:
+    """A sentence on the newest checkpoint from which training goes on."""
+    items = set(whole(frames))
+    found = [entry for entry in checkpoint.checkpoints(files.checkpoints) if items <= set(entry.items)]
+    return f"The last checkpoint is {found[0].path}." if found else "There is no checkpoint yet."
+
+
 class Record:
     """The metrics of a run so far, on disk and at hand."""
 
@@ -72,7 +79,7 @@ class Saves:
     def __init__(
         self, files: RunDirectory, seconds: float, echo: Callable[[str], None], frames: HostFrames | None = None
     ) -> None:
-        self._directory, self._seconds, self._echo = files.checkpoints, seconds, echo
+        self._files, self._directory, self._seconds, self._echo = files, files.checkpoints, seconds, echo
         self._frames, self._items = frames, whole(frames)
         self._last = time.monotonic()
         self.failed = False
@@ -116,10 +123,10 @@ class Saves:
             checkpoint.save(self._directory, counters.env_step, items, score=score)
         except checkpoint.SaveError as error:
             self.failed = True
-            found = checkpoint.checkpoints(self._directory)
-            kept = [entry for entry in found if set(self._items) <= set(entry.items)]  # training goes on from these
-            last = f"the last one is {kept[0].path}" if kept else "there is none yet"
-            self._echo(f"Not saved: {error}. Training goes on, and the next attempt is at the next interval; {last}.")
+            self._echo(
+                f"Not saved: {error}. Training goes on, and the next attempt is at the next interval. "
+                f"{last(self._files, self._frames)}"
+            )
             return
         self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from ne_dreamer_jax import settings
 from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.envs.config import WorkersConfig
 from ne_dreamer_jax.loop import Budget
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.runs.run_directory import RunDirectory
@@ -17,8 +18,6 @@ MAY_GROW = "loop.env_steps"
 MAY_CHANGE = ("loop.eval_every", "loop.eval_episodes", "loop.eval_max_steps", "loop.chunk_steps", "loop.max_skipped")
 """The settings that decide what is measured, how often the host hears of it and when a diverged run stops, and not what
 is learned: the same bits come out with any."""
-WORKERS = ("workers", "step_seconds", "on_failure")
-"""Settings in ``env`` of processes in which environments run, which may change likewise."""
 
 
 def settle(path: Path, asked: Config) -> Config:
@@ -52,8 +51,8 @@ def differences(stored: Config, asked: Config) -> list[str]:
         names.append("capacity")
     agreed: Any = {name: getattr(asked.loop, name) for name in names}
     agreed = replace(stored, loop=replace(stored.loop, **agreed))
-    if type(stored.env) is type(asked.env):
-        workers: Any = {name: getattr(asked.env, name) for name in WORKERS if hasattr(asked.env, name)}
+    if isinstance(stored.env, WorkersConfig) and type(stored.env) is type(asked.env):
+        workers: Any = {field.name: getattr(asked.env, field.name) for field in fields(WorkersConfig)}
         agreed = replace(agreed, env=replace(stored.env, **workers))
     lines = settings.differences(agreed, asked)
     hint = f" ({MAY_GROW} may only grow)"

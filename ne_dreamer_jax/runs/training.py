@@ -32,7 +32,7 @@ from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
 from ne_dreamer_jax.runs import checkpoint, fork, metrics, pictures, plots, progress, run_directory, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
-from ne_dreamer_jax.runs.record import Record, Saves
+from ne_dreamer_jax.runs.record import Record, Saves, last
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.runs.signals import Stop
@@ -120,8 +120,8 @@ def train(
     except jax.errors.JaxRuntimeError:
         if run.host.failure is None:
             raise
-        for line in [*run.host.lines(), f"Stopped: the environments failed: {run.host.failure}. {_last(files)}"]:
-            echo(line)
+        _tell(run, echo)
+        echo(f"Stopped: the environments failed: {run.host.failure}. {last(files, run.loop.frames)}")
         return ENVIRONMENT
     finally:
         run.host.close()
@@ -183,7 +183,7 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
             _tell(run, echo)
             if run.host is not None and run.host.should_stop:
                 saves.whole(state, counters, record.score(counters))
-                echo(f"Stopped, as an environment failed (env.on_failure=stop). {_last(files)}")
+                echo(f"Stopped, as an environment failed (env.on_failure=stop). {last(files, run.loop.frames)}")
                 return ENVIRONMENT
             if saves.due():
                 saves.whole(state, counters, record.score(counters))
@@ -191,14 +191,31 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
         if step < schedule.total:
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
             return NOT_SAVED if saves.failed else 128 + stopped_by
-    if not is_main_process:
-        return 0
+    return _finish(run, files, state, evaluation_key, record, saves, frames, echo) if is_main_process else 0
+
+
+def _finish(
+    run: Run,
+    files: RunDirectory,
+    state: LoopState,
+    key: jax.Array,
+    record: Record,
+    saves: Saves,
+    frames: Any,
+    echo: Echo,
+) -> int:
+    """What comes after the last step: pictures, a conclusion and the exit code.
+
+    Args:
+      key: of the run's evaluations.
+      frames: of the last one, if this start of the run had one.
+    """
     if not saves.failed:
         saves.prune(keep=1)  # nothing will go on from here
     # Frames of this start's last evaluation are newer than a video from before the run went on beyond an earlier end.
     if run.schedule.evaluation and images_of(run.agent.spec) and not (frames is None and files.video.exists()):
         if frames is None:  # the run was stopped between its last evaluation and here
-            frames = evaluate(run, state, evaluation_key, False, echo)[1]
+            frames = evaluate(run, state, key, False, echo)[1]
         pictures.attempt(
             lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
         )
@@ -370,9 +387,9 @@ def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, e
     guilty = sorted(name for name, value in counted.items() if f"{guard.PREFIX}{name}" in report.learning and value)
     echo(
         f"Stopped: {int(state.counters.skipped):,} updates in a row were not finite (loop.max_skipped is "
-        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. {_last(files)} "
-        "Try a lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the size of the rewards, or set "
-        "JAX_DEBUG_NANS=True to find the first operation."
+        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. "
+        f"{last(files, run.loop.frames)} Try a lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the "
+        "size of the rewards, or set JAX_DEBUG_NANS=True to find the first operation."
     )
     return DIVERGED
 
@@ -381,11 +398,6 @@ def _tell(run: Run, echo: Echo) -> None:
     """Says what happened to environments on the host."""
     for line in run.host.lines() if run.host is not None else ():
         echo(line)
-
-
-def _last(files: RunDirectory) -> str:
-    found = checkpoint.checkpoints(files.checkpoints)
-    return f"The last checkpoint is {found[0].path}." if found else "There is no checkpoint yet."
 
 
 @jax.jit

@@ -29,7 +29,7 @@ def test_a_full_disk_costs_the_checkpoints_and_nothing_else(tmp_path, monkeypatc
     refused = [line for line in said if line.startswith("Not saved: ")]
     assert "it takes up to" in refused[0]
     assert "10 B are free; make room there. Training goes on" in refused[0]
-    assert "there is none yet" in refused[0]
+    assert "There is no checkpoint yet" in refused[0]
     assert said[-1].startswith("The end of this run is not saved. Make room in ")
     assert "WARNING: that is too little" in " ".join(said)
     lines = metrics.read(tmp_path / "run" / "metrics.jsonl")
@@ -45,7 +45,7 @@ def test_a_disk_that_fills_up_leaves_the_checkpoint_before(tmp_path, monkeypatch
     code, said = train(tmp_path / "run")
     assert code == training.NOT_SAVED
     (kept,) = checkpoint.checkpoints(tmp_path / "run" / "checkpoints")
-    assert any(f"the last one is {kept.path}" in line for line in said)
+    assert any(f"The last checkpoint is {kept.path}" in line for line in said)
     monkeypatch.undo()
     code, said = train(tmp_path / "run")  # with room again
     assert code == 0

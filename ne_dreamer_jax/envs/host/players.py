@@ -26,6 +26,7 @@ class Seen(NamedTuple):
     reward: float
     is_last: bool
     is_terminal: bool
+    fault: str = ""  # why the episode is cut here, where it is: set by the worker
 
 
 class Player(Protocol):

@@ -17,9 +17,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ne_dreamer_jax.envs.host.players import Player
+from ne_dreamer_jax.envs.host.players import Player, Seen
 from ne_dreamer_jax.envs.host.spaces import Described
-from ne_dreamer_jax.envs.host.worker import BEGIN, NOTHING, STEP, Failed, Make, Seed, Step, Stepped
+from ne_dreamer_jax.envs.host.worker import BEGIN, NOTHING, STEP, Failed, Make, Seed, Step
+from ne_dreamer_jax.system import processors
 
 START_SECONDS = 600.0
 """What a worker may take to load its libraries and make its environments."""
@@ -141,7 +142,7 @@ class Pool:
           HostEnvError: an environment can't be made.
         """
         self.n, self._factory, self._options, self._report = n, factory, workers, report
-        count = min(n, workers.processes or processors())
+        count = min(n, workers.processes or processors.available())
         bounds = np.linspace(0, n, count + 1).astype(int)
         self._shares = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
         self._failures = np.zeros(n, int)
@@ -154,8 +155,8 @@ class Pool:
         """The number of the step that workers were last asked for."""
         self._asked = False  # whether they have not been heard since
         self._workers = [self._start(i) for i in range(count)]
-        for worker in self._workers:
-            self.described = self._described(worker)
+        for i in range(count):
+            self.described = self._ready(i, attempts=1)
 
     def seed(self, seeds: Sequence[int]) -> None:
         """Seeds the next beginnings of all environments."""
@@ -174,7 +175,7 @@ class Pool:
         for worker, share in zip(self._workers, self._shares, strict=True):
             worker.send(Step(actions[share], what[share]))
 
-    def finish(self, actions: np.ndarray, restart: np.ndarray) -> list[Stepped | Lost]:
+    def finish(self, actions: np.ndarray, restart: np.ndarray) -> list[Seen | Lost]:
         """Waits for the step that was asked for; workers that are gone or hang are replaced, and named.
 
         Returns:
@@ -224,44 +225,41 @@ class Pool:
         share = self._shares[number]
         return Worker(self._factory, share.stop - share.start, number)
 
-    def _described(self, worker: Worker) -> Described:
-        answer = worker.receive(START_SECONDS)
-        if isinstance(answer, Described):
-            return answer
+    def _ready(self, i: int, attempts: int) -> Described:
+        """Waits until a worker has made its environments, and starts it anew where it can't.
+
+        Raises:
+          HostEnvError: it can't in so many attempts; the pool is then closed.
+        """
+        for attempt in range(attempts):
+            if attempt:
+                time.sleep(attempt)
+                self._workers[i].close(0.0)
+                self._workers[i] = self._start(i)
+            answer = self._workers[i].receive(START_SECONDS)
+            if isinstance(answer, Described):
+                return answer
         self.close()
         raise HostEnvError(answer.error if isinstance(answer, Failed) else answer.why)
 
     def _replace(self, gone: Sequence[int]) -> None:
-        """Starts workers in place of those that are gone, all at the same time.
-
-        Raises:
-          HostEnvError: one can't be started in `STARTS` attempts.
-        """
+        """Starts workers in place of those that are gone, all at the same time. Errors as of `_ready`."""
         for i in gone:
             self._workers[i].close(0.0)
             self._workers[i] = self._start(i)
         for i in gone:
-            for attempt in range(STARTS):
-                answer = self._workers[i].receive(START_SECONDS)
-                if isinstance(answer, Described):
-                    break
-                if attempt == STARTS - 1:
-                    self.close()
-                    raise HostEnvError(answer.error if isinstance(answer, Failed) else answer.why)
-                time.sleep(attempt + 1.0)
-                self._workers[i].close(0.0)
-                self._workers[i] = self._start(i)
+            self._ready(i, STARTS)
             share = self._shares[i]
             self._restarts[share] += 1
             self._gone[share] = True
             numbers = zip(self._seeds[share], self._restarts[share], strict=True)
             self._workers[i].send(Seed([_seed(seed, number) for seed, number in numbers]))
 
-    def _counted(self, i: int, answer: Stepped | Failed | Lost | None, first: bool) -> Stepped | Lost:
+    def _counted(self, i: int, answer: Seen | Failed | Lost | None, first: bool) -> Seen | Lost:
         """Reports and counts what an environment failed at, on the ``first`` step of an episode or later."""
         if answer is None:
             return Lost("its worker was started anew")
-        if isinstance(answer, Stepped):
+        if isinstance(answer, Seen):
             if answer.fault:
                 self._report(f"environment {i}: {answer.fault}; its episode is cut.")
                 self._faults[i] = self._faults[i] + 1 if first else 0
@@ -278,14 +276,14 @@ class Pool:
             self._report(f"{why}; it is made anew, and its episode is cut.")
         return Lost(why)
 
-    def _note(self, i: int, answer: Stepped | Lost) -> None:
+    def _note(self, i: int, answer: Seen | Lost) -> None:
         """Counts steps without a failure, after so many of which, or an episode's end, failures are forgotten."""
-        fine = isinstance(answer, Stepped) and not answer.fault
+        fine = isinstance(answer, Seen) and not answer.fault
         self._steps[i] = self._steps[i] + 1 if fine else 0
-        if isinstance(answer, Stepped) and fine and (answer.is_last or self._steps[i] >= STEPS):
+        if isinstance(answer, Seen) and fine and (answer.is_last or self._steps[i] >= STEPS):
             self._failures[i] = 0
 
-    def _begin(self, i: int, actions: np.ndarray) -> Stepped | Failed | Lost:
+    def _begin(self, i: int, actions: np.ndarray) -> Seen | Failed | Lost:
         """Asks again for the first step of one environment's episode."""
         j = next(j for j, share in enumerate(self._shares) if share.start <= i < share.stop)
         share = self._shares[j]
@@ -409,11 +407,6 @@ class Pools:
 
     def _make(self, n: int) -> Pool:
         return Pool(self._factory, n, self.workers, self.failed)
-
-
-def processors() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _seed(seed: Any, restarts: Any) -> int:

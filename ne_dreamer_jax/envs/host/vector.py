@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
-from ne_dreamer_jax.envs.host.players import Player
+from ne_dreamer_jax.envs.host.players import Player, Seen
 from ne_dreamer_jax.envs.host.pool import HostEnvError, Pools, Workers
-from ne_dreamer_jax.envs.host.worker import Stepped
 from ne_dreamer_jax.envs.vector import Cuts, VectorEnv
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, DiscreteAction, EnvSpec, TimeStep
 
@@ -181,8 +180,8 @@ def _ask(
     except HostEnvError as error:
         pools.failure = str(error)
         raise
-    lost = lost | np.array([not isinstance(answer, Stepped) for answer in answers])
-    rows = [answer if isinstance(answer, Stepped) else None for answer in answers]
+    lost = lost | np.array([not isinstance(answer, Seen) for answer in answers])
+    rows = [answer if isinstance(answer, Seen) else None for answer in answers]
     column = lambda name, dtype: np.array([getattr(row, name) if row else 0 for row in rows], dtype)
     blank = {name: np.zeros(s.shape, s.dtype) for name, s in spec.observation.items()}
     return _Answer(

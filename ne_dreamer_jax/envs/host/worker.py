@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ne_dreamer_jax.envs.host.players import Player
+from ne_dreamer_jax.envs.host.players import Player, Seen
 
 STEP, BEGIN, NOTHING = 0, 1, 2
 """Whether an environment takes its action, begins an episode, or is left alone."""
@@ -39,20 +39,10 @@ class Seed(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Asks for a step of all environments; answered by a list of `Stepped`, `Failed` or, where left alone, None."""
+    """Asks for a step of all environments; answered by a list of `Seen`, `Failed` or, where left alone, None."""
 
     actions: Any  # [n, ...]
     what: Any  # int8 [n], of `STEP`, `BEGIN`, `NOTHING`
-
-
-class Stepped(NamedTuple):
-    """An environment's answer."""
-
-    obs: dict[str, np.ndarray]
-    reward: float
-    is_last: bool
-    is_terminal: bool
-    fault: str = ""  # why the episode is cut here, where it is
 
 
 class Failed(NamedTuple):
@@ -80,7 +70,7 @@ class Envs:
         """Seeds the next beginnings."""
         self._seeds = list(seeds)
 
-    def step(self, number: int, action: np.ndarray, what: int) -> Stepped | Failed | None:
+    def step(self, number: int, action: np.ndarray, what: int) -> Seen | Failed | None:
         """A step of one environment; what it raises is told, and the environment made anew at its next beginning."""
         if what == NOTHING:
             return None
@@ -90,8 +80,8 @@ class Envs:
                 player = self._players[number] = self._factory()
             if what == BEGIN:
                 seed, self._seeds[number] = self._seeds[number], None
-                return checked(Stepped(player.reset(seed), 0.0, False, False))
-            return checked(Stepped(*player.step(action)))
+                return checked(Seen(player.reset(seed), 0.0, False, False))
+            return checked(player.step(action))
         except Exception as error:
             self._drop(number)
             return Failed(summary(error))
@@ -108,7 +98,7 @@ class Envs:
                 player.close()
 
 
-def checked(stepped: Stepped) -> Stepped:
+def checked(stepped: Seen) -> Seen:
     """The same where all numbers are finite; else the episode's end, with zeros in place of what is not."""
     names = [f"obs[{name!r}]" for name, x in stepped.obs.items() if x.dtype == np.float32 and not np.isfinite(x).all()]
     names += ["the reward"] if not np.isfinite(np.float32(stepped.reward)) else []
@@ -118,7 +108,7 @@ def checked(stepped: Stepped) -> Stepped:
         name: np.where(np.isfinite(x), x, np.float32(0)) if x.dtype == np.float32 else x
         for name, x in stepped.obs.items()
     }
-    return Stepped(obs, 0.0, True, False, f"{', '.join(names)} is not finite")
+    return Seen(obs, 0.0, True, False, f"{', '.join(names)} is not finite")
 
 
 def summary(error: BaseException) -> str:
