@@ -97,7 +97,11 @@ def findings(
     check_env(env)
     report = _Report()
     if isinstance(env, VectorEnv):
-        _check_vector(env, report, key, num_envs, 2 * num_steps + beginning_steps, echo)
+        try:
+            _check_vector(env, report, key, num_envs, 2 * num_steps + beginning_steps, echo)
+        except Exception as error:
+            failure = env.host.failure if env.host is not None else None
+            report.add("prepare or step", "error", "environments that can be stepped", failure or _first_line(error))
         return list(report.found.values())
     echo("Looking at shapes and dtypes.")
     try:
@@ -287,7 +291,10 @@ def _played(
         timesteps.append(timestep)
     cuts = env.cuts(state)
     failed = np.asarray(cuts.faults)
-    report.expect(not failed.any(), "episodes", "error", "none that the environment cut", f"{failed} of them")
+    why = "".join(f"; {line}" for line in env.host.lines()[:3]) if env.host is not None else ""
+    report.expect(
+        not failed.any(), "episodes", "error", "none that the environment cut", f"{failed.sum()} of them{why}"
+    )
     if env.release is not None:
         env.release(state)
     return timesteps

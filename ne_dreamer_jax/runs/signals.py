@@ -8,12 +8,15 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable
 from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE = 0.5
 """Seconds that the main thread has to leave by itself after a second signal."""
+TOGETHER = 0.1
+"""Signals within so many seconds are one: GNU timeout sends its own twice, to the process and to its group."""
 
 
 class Stop:
@@ -27,6 +30,7 @@ class Stop:
 
     def __init__(self, echo: Callable[[str], None]) -> None:
         self.signal: int | None = None
+        self._asked = 0.0  # when, by the monotonic clock
         self._echo = echo
 
     def __enter__(self) -> Stop:
@@ -52,9 +56,14 @@ class Stop:
 
     def _ask(self, number: int, _: FrameType | None) -> None:
         """In the main thread, as soon as it runs Python again."""
-        self.signal = number
-        for other, handler in self._before.items():
-            signal.signal(other, signal.SIG_IGN if other == signal.SIGHUP else handler)
+        if self.signal is not None:
+            if time.monotonic() - self._asked > TOGETHER:
+                signal.signal(number, self._before[number])
+                signal.raise_signal(number)
+            return
+        self.signal, self._asked = number, time.monotonic()
+        if signal.SIGHUP in self._before:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with contextlib.suppress(RuntimeError):  # it came in the middle of another line
             self._echo(
                 "\nStopping when this chunk is done, to save a checkpoint. A second time stops at once, without."
@@ -62,10 +71,13 @@ class Stop:
 
     def _watch(self) -> None:
         """In a thread of its own, which hears of signals while the main thread is in a library."""
-        heard = 0
+        first: float | None = None
         while received := self._woken.recv(16):
             for number in received:
-                heard += number in self._before and number != signal.SIGHUP
+                if number not in self._before or number == signal.SIGHUP:
+                    continue
+                now = time.monotonic()
+                first = now if first is None else first
                 typed = number == signal.SIGINT and hasattr(sys, "ps1")
-                if heard >= 2 and not typed and not self._over.wait(GRACE):
+                if now - first > TOGETHER and not typed and not self._over.wait(GRACE):
                     os._exit(128 + number)

@@ -311,11 +311,26 @@ def test_conformance_names_what_is_not_repeatable():
     assert {finding.kind for finding in found} == {"determinism"}
 
 
+@pytest.mark.parametrize(("how", "why"), [("raises", "the door is stuck"), ("nan", r"obs['count'] is not finite")])
+def test_conformance_says_why_episodes_are_cut(how, why):
+    env = made(from_gymnasium(functools.partial(host_fakes.Failing, how)))
+    found = conformance.findings(env, jax.random.key(0), echo=lambda line: None)
+    assert any(finding.kind == "error" and why in finding.got for finding in found), found
+
+
 class Unseeded(host_fakes.Counting):
     """Draws from the system's randomness."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         return super().reset(seed=int.from_bytes(os.urandom(4), "little"))
+
+
+def test_a_gymnasium_environment_by_its_function():
+    env = made(envs.make("gym:tests.envs.host_fakes:Counting"))
+    _, timesteps = play(env, 3, KEYS[:1])
+    assert counts(timesteps, 0) == [0, 1, 2]
+    with pytest.raises(ValueError, match=r"gym:no\.such:thing: No module named 'no'; run the command where"):
+        envs.make("gym:no.such:thing")
 
 
 # Failures.
@@ -359,6 +374,25 @@ class FailsInSecond:
         if os.environ["NE_DREAMER_WORKER"] == "1":
             return host_fakes.Failing(self.how, os.path.join(self.folder, "failed"))
         return host_fakes.Counting()
+
+
+def test_an_image_of_another_shape_than_its_space_is_named_as_it_came():
+    env = made(from_gymnasium(ChannelsFirst, Options(image_size=16)))
+    state, _ = play(env, 2, KEYS[:1])
+    assert env.cuts(state).faults.tolist() == [1]
+    (told,) = env.host.lines()
+    assert "'image': expected uint8 [32, 32, 3], as its space says, got uint8 [3, 32, 32]" in told
+
+
+class ChannelsFirst(host_fakes.Counting):
+    """Its pictures are not as its space says once an episode has begun."""
+
+    def __init__(self) -> None:
+        super().__init__(pixels=True)
+
+    def _obs(self) -> Any:
+        obs = super()._obs()
+        return obs | ({"image": obs["image"].transpose(2, 0, 1)} if self.t else {})
 
 
 def test_an_environment_that_always_fails_is_given_up():

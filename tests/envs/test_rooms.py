@@ -245,7 +245,7 @@ def test_examples_can_be_seen_and_not_reached():
 
 
 def test_maps_differ_and_no_other_is_the_match():
-    maps = jax.vmap(lambda key: nonmatching._new_map(jnp.asarray(7, jnp.int32), key))(
+    maps = jax.vmap(lambda key: nonmatching._new_map(jnp.asarray(7, jnp.int32), key, nonmatching.OBJECTS))(
         jax.random.split(jax.random.key(0), 4000)
     )
     other = np.asarray(maps.other)

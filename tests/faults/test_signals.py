@@ -62,6 +62,7 @@ def send():
         time.sleep(0.3)
         os.kill(os.getpid(), int(sys.argv[1]))
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background ignores
 spin = jax.jit(lambda x: jax.lax.fori_loop(0, 2**31 - 2, lambda i, x: x * 0.5 + 1.0, x)).lower(jnp.zeros(())).compile()
 with Stop(print):
     threading.Thread(target=send, daemon=True).start()
@@ -80,6 +81,27 @@ def test_a_second_signal_leaves_at_once_while_the_main_thread_is_in_a_library(nu
     assert (done.returncode, done.stderr) == (128 + number, "")
     assert "came to its end" not in done.stdout
     print(f"left {seconds:.2f} s after the second one")
+
+
+DOUBLED = """
+import os, signal, time
+from ne_dreamer_jax.runs.signals import Stop
+
+with Stop(lambda line: None) as stop:
+    for pause in (0.02, 2.0):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(pause)
+    print("goes on", stop.signal, flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(5)
+    print("came to its end")
+"""
+
+
+def test_a_signal_that_is_sent_twice_at_once_is_one():
+    """As GNU timeout does."""
+    done = subprocess.run([sys.executable, "-c", DOUBLED], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, f"goes on {signal.SIGTERM:d}\n", "")
 
 
 @pytest.mark.slow

@@ -70,6 +70,7 @@ def test_a_policy_is_played_elsewhere_too(by_name):
         nedreamer.evaluate(path, also="gym:CartPole-v1", echo=said.append)
 
 
+@pytest.mark.slow
 def test_a_failure_stops_the_run_where_that_is_chosen_and_the_run_goes_on_later(tmp_path):
     env = from_gymnasium(
         functools.partial(host_fakes.Failing, "raises", str(tmp_path / "mark")),
@@ -115,6 +116,7 @@ def test_environments_that_fail_again_and_again_end_the_run_with_a_sentence(tmp_
     assert "Stopped: the environments failed: environment 0 raised RuntimeError: the door is stuck" in said[-1]
 
 
+@pytest.mark.slow
 def test_stepping_while_learning_changes_nothing():
     env = from_dm_env(host_fakes.make_walk)
     config = toy.config()

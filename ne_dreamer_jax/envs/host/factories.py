@@ -27,17 +27,26 @@ class Made:
 def _gymnasium(task: str, options: Options) -> Player:
     import gymnasium
 
+    module, colon, name = task.rpartition(":")
+    factory = getattr(_imported(module, f"gym:{task}"), name, None) if colon else None
+    if callable(factory):
+        return GymnasiumPlayer(factory(), options)
     names.register_installed()
     drawn = None if options.observe == "own" else "rgb_array"
     return GymnasiumPlayer(gymnasium.make(task, render_mode=drawn), options)
 
 
+def _imported(module: str, name: str) -> Any:
+    """Raises ValueError where the environment's ``name`` names a module that can't be imported."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(f"{name}: {error}; run the command where Python finds {module}") from error
+
+
 def _dm_env(task: str, options: Options) -> Player:
     module, _, function = task.partition(":")
-    try:
-        factory = getattr(importlib.import_module(module), function, None)
-    except ImportError as error:
-        raise ValueError(f"dm_env:{task}: {error}; run the command where Python finds {module}") from error
+    factory = getattr(_imported(module, f"dm_env:{task}"), function, None)
     if not callable(factory):
         raise ValueError(f"dm_env:{task}: expected a function {function} in {module}")
     return DmEnvPlayer(factory(), options)

@@ -87,7 +87,16 @@ def observation(name: str, space: Any, image_size: int | None) -> tuple[str, tup
         )
     channels = shape[2] if len(shape) == 3 else 1
     size = shape[:2] if image_size is None else (image_size, image_size)
-    return name or "image", (*size, channels), "uint8", lambda image: resized(np.asarray(image), size)
+
+    def read(value: Any) -> np.ndarray:
+        image = np.asarray(value)
+        if image.shape != shape or image.dtype != np.uint8:
+            raise ValueError(
+                f"{where}: expected uint8 {list(shape)}, as its space says, got {image.dtype} {list(image.shape)}"
+            )
+        return resized(image, size)
+
+    return name or "image", (*size, channels), "uint8", read
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -40,6 +41,8 @@ SIZES = np.array(
 )
 GLOWS = np.array([(255, 50, 138), (130, 214, 241), (95, 236, 155)], np.float32)  # pink, light blue, green
 OBJECTS = len(SHAPES) * len(GLOWS)
+FEW = (0, 13, 26)
+"""Three objects of three shapes and three colours: a small agent has little time to tell many apart."""
 BODY = (41.0, 41.0, 41.0)
 
 
@@ -93,15 +96,15 @@ def touches_pad(at: Places, position: Array) -> Array:
 class Nonmatching(NamedTuple):
     """One map: drawn anew each time that the player comes back to the first room."""
 
-    match: Array  # int32 [], the object to avoid, in 0 .. 35; the same all episode
+    match: Array  # int32 [], the object to avoid, among the task's; the same all episode
     other: Array  # int32 [], the one to take
     example: Array  # int32 [], which of the two spots shows ``match``
     place: Array  # int32 [], the choice spot where ``other`` is
 
 
-def _new_map(match: Array, key: Array) -> Nonmatching:
+def _new_map(match: Array, key: Array, objects: int) -> Nonmatching:
     other_key, example_key, place_key = jax.random.split(key, 3)
-    other = jax.random.randint(other_key, (), 0, OBJECTS - 1, jnp.int32)
+    other = jax.random.randint(other_key, (), 0, objects - 1, jnp.int32)
     coin = lambda key: jax.random.randint(key, (), 0, 2, jnp.int32)
     return Nonmatching(match, other + (other >= match).astype(jnp.int32), coin(example_key), coin(place_key))
 
@@ -129,8 +132,9 @@ def _faces(at: Places) -> np.ndarray:
     return np.concatenate([layout.inside(at.room_1), np.array(rows, np.float32)])
 
 
-def make(scale: float = 1.0) -> Game:
-    """The task, in rooms of DMLab's size or of ``scale`` times that."""
+def make(scale: float = 1.0, objects: Sequence[int] = range(OBJECTS)) -> Game:
+    """The task, in rooms of DMLab's size or of ``scale`` times that, with all of its objects or some."""
+    kinds = jnp.asarray(np.array(objects, np.int32))
     at = places(scale)
     walls, ends = solids(at), _faces(at)
     start, exit_ = jnp.asarray(at.start), jnp.asarray(at.exit)
@@ -138,8 +142,8 @@ def make(scale: float = 1.0) -> Game:
 
     def begin(key: Array) -> tuple[Body, Nonmatching]:
         match_key, map_key = jax.random.split(key)
-        match = jax.random.randint(match_key, (), 0, OBJECTS, jnp.int32)
-        return standing(start, jnp.zeros((), jnp.float32)), _new_map(match, map_key)
+        match = jax.random.randint(match_key, (), 0, len(kinds), jnp.int32)
+        return standing(start, jnp.zeros((), jnp.float32)), _new_map(match, map_key, len(kinds))
 
     def frame(body: Body, task: Nonmatching, controls: Array, clock: Array, key: Array) -> Frame:
         body = walk(body, controls, walls)
@@ -151,13 +155,13 @@ def make(scale: float = 1.0) -> Game:
         reached = within_reach(body.position, choices)
         right, wrong = reached[task.place], reached[1 - task.place]
         chosen = right | wrong
-        fresh = standing(start, jnp.zeros((), jnp.float32)), _new_map(task.match, key)
+        fresh = standing(start, jnp.zeros((), jnp.float32)), _new_map(task.match, key, len(kinds))
         body, task = jax.tree.map(lambda a, b: jnp.where(chosen, a, b), fresh, (body, task))
         reward = jnp.where(on_pad, 1.0, 0.0) + jnp.where(right, 10.0, jnp.where(wrong, -10.0, 0.0))
         return Frame(body, task, reward, jnp.zeros((), bool))
 
     def scene(body: Body, task: Nonmatching, clock: Array) -> draw.Scene:
-        ids = jnp.stack([task.match, task.match, task.other])
+        ids = kinds[jnp.stack([task.match, task.match, task.other])]
         shown = jnp.stack([examples[task.example], choices[1 - task.place], choices[task.place], pad])
         shape, glow = ids // len(GLOWS), ids % len(GLOWS)
         pulse = 1.0 + 0.15 * jnp.sin(2 * jnp.pi * 0.2 * clock.astype(jnp.float32) / 60)

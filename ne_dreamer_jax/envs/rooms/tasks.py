@@ -17,6 +17,11 @@ DEFERRED = {"rooms/exploit_deferred_effects": deferred.TRAIN, "rooms/exploit_def
 """Task -> its configurations."""
 NONMATCHING = {"rooms/select_nonmatching_object": 1.0, "rooms/select_nonmatching_object_small": 0.36}
 """Task -> the size of its rooms. A random player of the small one comes to a choice four times in an episode."""
+OBJECTS = {
+    "rooms/select_nonmatching_object": range(nonmatching.OBJECTS),
+    "rooms/select_nonmatching_object_small": nonmatching.FEW,
+}
+"""Task -> the objects that it draws from."""
 WATERMAZE = {"rooms/watermaze": 1.0, "rooms/watermaze_small": 0.42}
 """Task -> the size of its arena. In the small one it is 2 to 3 seconds from side to side."""
 
@@ -26,7 +31,7 @@ def game(name: str) -> Game:
     makers: dict[str, Callable[[], Game]] = {
         **{name: partial(collect.make, configs) for name, configs in COLLECT.items()},
         **{name: partial(deferred.make, configs) for name, configs in DEFERRED.items()},
-        **{name: partial(nonmatching.make, scale) for name, scale in NONMATCHING.items()},
+        **{name: partial(nonmatching.make, scale, OBJECTS[name]) for name, scale in NONMATCHING.items()},
         **{name: partial(watermaze.make, scale) for name, scale in WATERMAZE.items()},
     }
     if name not in makers:
