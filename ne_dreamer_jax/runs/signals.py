@@ -58,7 +58,7 @@ class Stop:
         """In the main thread, as soon as it runs Python again."""
         if self.signal is not None:
             if time.monotonic() - self._asked > TOGETHER:
-                signal.signal(number, self._before[number])
+                signal.signal(number, self._before[signal.Signals(number)])
                 signal.raise_signal(number)
             return
         self.signal, self._asked = number, time.monotonic()
