@@ -1,6 +1,8 @@
 """A run directory belongs to one run; nothing else is ever touched."""
 
 import dataclasses
+import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -83,6 +85,16 @@ def test_two_processes_do_not_share_a_run(tmp_path):
         holder.communicate(b"")
     with run_directory.claim(tmp_path, Config()):
         pass
+
+
+def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(RefusedError, match=r"can't be locked .*Choose a --logdir on another file system"):
+        run_directory.claim(tmp_path / "run", Config()).__enter__()
+    assert not (tmp_path / "run" / "config.json").exists()
 
 
 def test_a_crash_before_the_configuration_was_written_starts_anew(tmp_path):

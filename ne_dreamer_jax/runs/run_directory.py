@@ -168,6 +168,11 @@ def claim(path: Path, config: Any, differences: Differences = settings.differenc
             fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RefusedError(f"another process trains in {path}. Wait for it, or choose another --logdir") from None
+        except OSError as error:  # some network mounts have no locks
+            raise RefusedError(
+                f"{path} can't be locked ({error.strerror or error}), so that two processes could train there at once. "
+                "Choose a --logdir on another file system, such as a local disk, and copy it when the run has ended"
+            ) from error
         check_same(path, config, differences)
         try:
             if not files.config.exists():
