@@ -1,19 +1,25 @@
 """The README's commands are the ones that are checked."""
 
 import re
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import ne_dreamer_jax as nedreamer
 from experiments import train
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.settings import names
+from tests.envs import fakes
 from tests.experiments import toy
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -49,12 +55,38 @@ def test_the_readmes_gymnasium_environment_is_trained_in(tmp_path, monkeypatch):
     tiny = toy.config()
     monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
     monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
-    (code,) = blocks("### Environments of gymnasium and dm_env")
     made: dict[str, Any] = {}
-    exec(compile(code, "README.md", "exec"), made)
+    of_gymnasium, of_dm_env = blocks("### Environments of gymnasium and dm_env")
+    exec(compile(of_gymnasium, "README.md", "exec"), made)
     made["env"].host.close()
     assert made["env"].spec.observation["vector"].shape == (3,)
     assert (tmp_path / "runs" / "pendulum" / "curve.png").exists()
+    exec(compile(of_dm_env, "README.md", "exec"), made)
+    made["env"].host.close()
+    assert set(made["env"].spec.observation) == {"position", "to_target", "velocity"}
+    assert (tmp_path / "runs" / "reacher" / "curve.png").exists()
+
+
+def test_the_readmes_gymnax_environment_is_trained_in(tmp_path, monkeypatch):
+    """With a stand-in for the library, whose package tests do not need."""
+    monkeypatch.chdir(tmp_path)
+    tiny = toy.config()
+    monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
+    monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
+    (code,) = blocks("### Environments of other JAX libraries")
+    asked = []
+
+    class Parameters:
+        def replace(self, **changes: int) -> fakes.Params:
+            asked.append(changes)
+            return fakes.Params()
+
+    library: Any = types.ModuleType("gymnax")
+    library.make = lambda name: (fakes.Gymnax(), Parameters())
+    monkeypatch.setitem(sys.modules, "gymnax", library)
+    exec(compile(code, "README.md", "exec"), {})
+    assert asked == [{"memory_length": 20}]
+    assert (tmp_path / "runs" / "chain" / "evaluation.json").exists()
 
 
 def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
