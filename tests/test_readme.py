@@ -14,7 +14,7 @@ import pytest
 import ne_dreamer_jax as nedreamer
 from experiments import train
 from ne_dreamer_jax import make_agent
-from ne_dreamer_jax.envs import registry
+from ne_dreamer_jax.envs import host, registry
 from ne_dreamer_jax.settings import names
 from tests.envs import fakes
 from tests.experiments import toy
@@ -50,29 +50,38 @@ def blocks(heading):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-def test_the_readmes_gymnasium_environment_is_trained_in(tmp_path, monkeypatch):
+@pytest.fixture
+def tiny_runs(tmp_path, monkeypatch):
+    """The folder that runs of the README's code go to, with a tiny agent in place of a preset's."""
     monkeypatch.chdir(tmp_path)
     tiny = toy.config()
     monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
     monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
+    return tmp_path / "runs"
+
+
+def test_the_readmes_gymnasium_environment_is_trained_in(tiny_runs):
     made: dict[str, Any] = {}
-    of_gymnasium, of_dm_env = blocks("### Environments of gymnasium and dm_env")
-    exec(compile(of_gymnasium, "README.md", "exec"), made)
+    code, _ = blocks("### Environments of gymnasium and dm_env")
+    exec(compile(code, "README.md", "exec"), made)
     made["env"].host.close()
     assert made["env"].spec.observation["vector"].shape == (3,)
-    assert (tmp_path / "runs" / "pendulum" / "curve.png").exists()
-    exec(compile(of_dm_env, "README.md", "exec"), made)
+    assert (tiny_runs / "pendulum" / "curve.png").exists()
+
+
+@pytest.mark.slow
+def test_the_readmes_dm_env_environment_is_trained_in(tiny_runs):
+    _, code = blocks("### Environments of gymnasium and dm_env")
+    made: dict[str, Any] = {"host": host, "nedreamer": nedreamer, "config": toy.config()}
+    exec(compile(code, "README.md", "exec"), made)
     made["env"].host.close()
     assert set(made["env"].spec.observation) == {"position", "to_target", "velocity"}
-    assert (tmp_path / "runs" / "reacher" / "curve.png").exists()
+    assert (tiny_runs / "reacher" / "curve.png").exists()
 
 
-def test_the_readmes_gymnax_environment_is_trained_in(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_the_readmes_gymnax_environment_is_trained_in(tiny_runs, monkeypatch):
     """With a stand-in for the library, whose package tests do not need."""
-    monkeypatch.chdir(tmp_path)
-    tiny = toy.config()
-    monkeypatch.setattr("ne_dreamer_jax.config.preset", lambda name: tiny)
-    monkeypatch.setattr("ne_dreamer_jax.config.override", lambda config, assignment: config)
     (code,) = blocks("### Environments of other JAX libraries")
     asked = []
 
@@ -86,7 +95,7 @@ def test_the_readmes_gymnax_environment_is_trained_in(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnax", library)
     exec(compile(code, "README.md", "exec"), {})
     assert asked == [{"memory_length": 20}]
-    assert (tmp_path / "runs" / "chain" / "evaluation.json").exists()
+    assert (tiny_runs / "chain" / "evaluation.json").exists()
 
 
 def test_the_readmes_environment_is_one(tmp_path, monkeypatch):
