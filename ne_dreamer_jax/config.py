@@ -108,6 +108,24 @@ def quickstart(size: str) -> Config:
     return Config(DmcConfig("dmc/cheetah_run", image_size=32), agent, loop)
 
 
+def rooms_small(size: str) -> Config:
+    """Learns to remember on two CPU cores: the quickstart's agent with half the state, on a small Rooms task.
+
+    Frames of 24 x 24 are halved three times. A trial of the task takes some nine steps, so that most of the sequences
+    of 16 hold what is to be remembered and what comes of it; returns are in tens, and need no smaller floor than 1.
+    """
+    config = quickstart(size)
+    assert isinstance(config.agent, AgentConfig)
+    agent = replace(
+        config.agent,
+        encoder=replace(config.agent.encoder, multipliers=(2, 3, 4)),
+        rssm=replace(config.agent.rssm, deter=config.agent.rssm.deter // 2),
+        behavior=replace(config.agent.behavior, horizon=8, return_floor=1.0),
+    )
+    loop = LoopConfig(env_steps=320_000, replay_ratio=32.0, prefill=2_000, eval_every=32_000, eval_episodes=32)
+    return Config(RoomsConfig("rooms/select_nonmatching_object_small", image_size=24), agent, loop)
+
+
 def smoke(size: str) -> Config:
     """A minute or two on a CPU: touches everything, learns nothing."""
     agent = replace(agent_config(size), batch_size=4, batch_length=16)
@@ -134,6 +152,7 @@ def released_code(size: str) -> Config:
 PRESETS = {
     "dmc": (dmc, "12m"),
     "rooms": (rooms, "12m"),
+    "rooms_small": (rooms_small, "1m"),
     "released_code": (released_code, "12m"),
     "quickstart": (quickstart, "1m"),
     "smoke": (smoke, "1m"),

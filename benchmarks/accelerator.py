@@ -1,0 +1,133 @@
+"""All that is to be known of one accelerator, within minutes: ``python -m benchmarks.accelerator --help``.
+
+Each stage is one command of this folder in a process of its own, so that one that fails, or runs out of memory, costs
+the others nothing. What comes first matters most: stages for which no time is left are named and left out.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from ne_dreamer_jax.commands.options import UserPath, say
+
+TINY = ("batch_size=2", "batch_length=8", "behavior.horizon=2")
+
+
+class Stage(NamedTuple):
+    """A command, and what takes its arguments' place in the smallest setting."""
+
+    name: str
+    module: str
+    arguments: tuple[str, ...]
+    smallest: tuple[str, ...]
+    seconds: float  # that it must be given, or it is not begun
+
+
+def _set(*assignments: str) -> tuple[str, ...]:
+    return tuple(word for assignment in assignments for word in ("--set", f"agent.{assignment}"))
+
+
+def _update(size: str, dtype: str, seconds: float, *more: str) -> Stage:
+    arguments = ("--size", size, "--rounds", "5", *more, *_set(f"compute_dtype={dtype}"))
+    smallest = ("--size", "1m", "--rounds", "1", "--no-parts", *_set(f"compute_dtype={dtype}", *TINY))
+    return Stage(f"an update, {size}, {dtype}", "train_step", arguments, smallest, seconds)
+
+
+def _rollout(name: str, *arguments: str) -> Stage:
+    counts = ("--envs", "16", "--envs", "256", "--envs", "4096", "--rounds", "3")
+    return Stage(
+        name, "rollout", (*counts, *arguments), ("--envs", "2", "--steps", "2", "--rounds", "1", *arguments), 40
+    )
+
+
+STAGES = (
+    _update("12m", "float32", 60, "--no-parts"),
+    _update("12m", "bfloat16", 60, "--no-parts"),
+    Stage("losses beside the CPU's", "agreement", ("--size", "1m"), ("--updates", "2", *_set(*TINY)), 60),
+    Stage(
+        "a chunk's shares", "loop", ("--task", "dmc/walker_walk", "--size", "12m"),
+        ("--size", "1m", "--capacity", "2048", "--rounds", "1", *_set(*TINY)), 90,
+    ),
+    _rollout("environments, from vectors", "--obs", "vector"),
+    _rollout("environments, from pixels", "--obs", "pixels"),
+    Stage(
+        "seeds at once", "seeds", ("--seeds", "1", "--seeds", "8"),
+        ("--seeds", "2", "--rounds", "1", *_set(*TINY)), 60,
+    ),
+    _update("50m", "bfloat16", 60, "--no-parts"),
+    _update("200m", "bfloat16", 90, "--no-parts"),
+    Stage(
+        "Rooms", "rooms", ("--task", "rooms/watermaze", "--rounds", "3"),
+        ("--task", "rooms/watermaze", "--envs", "2", "--pictures", "4", "--rounds", "1"), 40,
+    ),
+    Stage(
+        "methods", "methods", ("--size", "12m"),
+        ("--size", "1m", "--method", "dreamer_no_reconstruction", "--rounds", "1"), 120,
+    ),
+    Stage("an image's place", "storage", (), ("--rows", "8", "--rounds", "1"), 30),
+    _update("12m", "float32", 120),
+    Stage("memory", "memory", ("--no-compile",), ("--no-compile", "--size", "1m"), 20),
+)  # fmt: skip
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option("--output", type=UserPath(), required=True, help="A new folder: each stage's output and results.jsonl.")
+@click.option("--minutes", type=click.FloatRange(0, min_open=True), default=9.0, show_default=True, help="In all.")
+@click.option("--smallest", is_flag=True, help="Everything as small as it goes, to see that it runs; on a CPU, too.")
+def main(output: Path, minutes: float, smallest: bool) -> None:
+    """Run the benchmarks that tell of an accelerator, the most important first, and keep what they print."""
+    try:
+        output.mkdir(parents=True)
+    except OSError as error:
+        raise click.UsageError(
+            f"--output: expected a folder that can be made, got {output}: {error.strerror}"
+        ) from error
+    deadline, told = time.monotonic() + 60 * minutes, []
+    for number, stage in enumerate(STAGES, 1):
+        left = deadline - time.monotonic()
+        if left < stage.seconds and not smallest:
+            told.append(f"{stage.name}: left out, {left:.0f} s are left and {stage.seconds:.0f} are needed")
+        else:
+            told.append(_run(stage, output, f"{number:02}", smallest, max(left, 1.0)))
+        say(told[-1])
+    failed = [line for line in told if ": failed" in line]
+    say(f"{len(told) - len(failed)} of {len(told)} stages are done or left out; their figures are in {output}")
+    raise SystemExit(1 if failed else 0)
+
+
+def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float) -> str:
+    """Runs a stage, stores what it prints, and says how it went."""
+    arguments = stage.smallest if smallest else stage.arguments
+    command = [sys.executable, "-m", f"benchmarks.{stage.module}", *arguments]
+    begin = time.monotonic()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds)
+    except subprocess.TimeoutExpired:
+        return f"{stage.name}: failed, it took longer than the {seconds:.0f} s that were left"
+    taken = time.monotonic() - begin
+    text = f"$ python -m benchmarks.{stage.module} {' '.join(arguments)}\n{done.stdout}{done.stderr}"
+    (output / f"{number}_{stage.module}.txt").write_text(text, encoding="utf-8")
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["nothing said"])[-1]
+        return f"{stage.name}: failed with exit code {done.returncode} after {taken:.0f} s: {last}"
+    with (output / "results.jsonl").open("a", encoding="utf-8") as results:
+        for line in _results(done.stdout.splitlines()):
+            results.write(json.dumps({"stage": stage.name, "seconds_in_all": taken, **line}) + "\n")
+    return f"{stage.name}: done in {taken:.0f} s"
+
+
+def _results(lines: Sequence[str]) -> list[dict[str, Any]]:
+    """The JSON lines that benchmarks print for programs."""
+    return [json.loads(line) for line in lines if line.startswith("{")]
+
+
+if __name__ == "__main__":
+    main()

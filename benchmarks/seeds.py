@@ -1,0 +1,70 @@
+"""What several runs at once cost beside one: ``python -m benchmarks.seeds --help``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import click
+
+from ne_dreamer_jax.commands.options import Name, Task, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.pages import use_large_pages
+from ne_dreamer_jax.system.quiet import quiet
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option("--seeds", "counts", type=click.IntRange(1), multiple=True, default=(1, 4), show_default=True)
+@click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart", show_default=True)
+@click.option("--task", type=Task(), default="dmc/cartpole_swingup", show_default=True)
+@click.option("--steps", type=click.IntRange(1), default=8, show_default=True, help="Vector steps of a timed chunk.")
+@click.option("--rounds", type=click.IntRange(1), default=5, show_default=True)
+@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
+def main(
+    counts: tuple[int, ...], preset: str, task: str, steps: int, rounds: int, assignments: tuple[str, ...]
+) -> None:
+    """A training chunk of one run, and of several under vmap (`loop.over_seeds`); updates a second over all of them."""
+    quiet()
+    from benchmarks import common
+    from experiments.train import configure
+
+    with refusing(ValueError):
+        config = configure(preset, None, None, {"env.task": task}, assignments)
+    cases = {f"{count} seeds": _chunk(config, count, steps) for count in dict.fromkeys(counts)}
+    updates = {name: int(case()[0].sum()) for name, case in cases.items()}
+    measured = common.measure(cases, rounds=rounds)
+    columns: dict[str, dict[str, Any]] = {
+        name: {"updates_per_s": updates[name] / timing.median} for name, timing in measured.cases.items()
+    }
+    common.report("seeds", measured, settings={"preset": preset, "task": task, "vector_steps": steps}, columns=columns)
+
+
+def _chunk(config: Any, count: int, steps: int) -> Callable[[], Any]:
+    """A function that goes on with training, past the steps before the first update; it returns updates of each run."""
+    import jax
+    import jax.numpy as jnp
+
+    import ne_dreamer_jax as nedreamer
+    from ne_dreamer_jax import loop as loops
+    from ne_dreamer_jax.envs import config as env_configs
+
+    env = env_configs.make(config.env)
+    agent = nedreamer.make_agent(config.agent, env.spec)
+    loop = loops.make(replace(config.loop, capacity=20_000), env, agent, config.env.action_repeat)
+    init, chunk = loops.over_seeds(loop)
+    held: list[Any] = []
+
+    def case() -> Any:
+        if not held:
+            state = init(jax.vmap(jax.random.key)(jnp.arange(count)))
+            held.append(chunk(state, jnp.asarray(loop.budget.prefill, jnp.int32))[0])
+        held[0], report = chunk(held[0], jnp.asarray(steps, jnp.int32))
+        return (report.updates,)
+
+    return case
+
+
+if __name__ == "__main__":
+    use_large_pages("benchmarks.seeds")
+    main()
