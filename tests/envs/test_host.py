@@ -21,7 +21,7 @@ import pytest
 
 from ne_dreamer_jax import envs
 from ne_dreamer_jax.envs import conformance
-from ne_dreamer_jax.envs.host import Options, Workers, dmlab, from_dm_env, from_gymnasium, players, spaces
+from ne_dreamer_jax.envs.host import Options, Workers, dmlab, factories, from_dm_env, from_gymnasium, players, spaces
 from ne_dreamer_jax.envs.vector import VectorEnv
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, DiscreteAction, TimeStep
 from tests.envs import host_fakes
@@ -309,6 +309,38 @@ def test_conformance_names_what_is_not_repeatable():
     env = made(from_gymnasium(lambda: Unseeded()))
     found = conformance.findings(env, jax.random.key(0), echo=lambda line: None)
     assert {finding.kind for finding in found} == {"determinism"}
+
+
+def test_a_seed_reaches_environments_that_take_it_when_they_are_made():
+    made_with: list[Any] = []
+
+    class Drawn(host_fakes.Walk):
+        """Has a random start, as Memory Maze's levels, and physics that are gone when it is closed."""
+
+        def __init__(self, seed: int | None) -> None:
+            super().__init__()
+            made_with.append(seed)
+            self.random_state = np.random.RandomState(seed)
+
+        @property
+        def physics(self) -> Any:
+            return SimpleNamespace(free=gone)
+
+        def _obs(self) -> Any:
+            return {"t": np.int64(self.random_state.randint(1_000)), "phase": np.int32(0)}
+
+    def gone() -> None:
+        raise ReferenceError("weakly-referenced object no longer exists")
+
+    player = factories._Remade(lambda seed: players.DmEnvPlayer(Drawn(seed), Options()))
+    first, second = (player.reset(seed)["t"] for seed in (5, None))
+    again, other = (player.reset(seed)["t"] for seed in (5, 6))
+    player.close()
+    assert first == again
+    assert len({float(x) for x in (first, second, other)}) == 3
+    assert made_with == [None, 5, 5, 6]
+    composers = players.DmEnvPlayer(Drawn(1), Options())
+    assert composers.reset(7)["t"] == composers.reset(7)["t"]
 
 
 @pytest.mark.parametrize(("how", "why"), [("raises", "the door is stuck"), ("nan", r"obs['count'] is not finite")])

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ne_dreamer_jax.envs.host import names, opengl
 from ne_dreamer_jax.envs.host.dmlab import LabPlayer
-from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options, Player
+from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options, Player, Seen
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,35 @@ def _dmlab(task: str, options: Options) -> Player:
     return LabPlayer(task, options)
 
 
+class _Remade:
+    """An environment that takes its seed when it is made, and is made anew for each."""
+
+    def __init__(self, make: Callable[[int | None], Player]) -> None:
+        self._make = make
+        self._player = make(None)
+        self.described = self._player.described
+
+    def reset(self, seed: int | None) -> dict[str, np.ndarray]:
+        """Begins an episode."""
+        if seed is not None:
+            self._player.close()
+            self._player = self._make(seed)
+        return self._player.reset(None)
+
+    def step(self, action: np.ndarray) -> Seen:
+        """As the environment's own."""
+        return self._player.step(action)
+
+    def close(self) -> None:
+        """Closes it."""
+        self._player.close()
+
+
 def _memory_maze(task: str, options: Options) -> Player:
     opengl.allow()
     from memory_maze import tasks
 
-    return DmEnvPlayer(getattr(tasks, f"memory_maze_{task}")(), options)
+    return _Remade(lambda seed: DmEnvPlayer(getattr(tasks, f"memory_maze_{task}")(seed=seed), options))
 
 
 _CAMERAS = {"quadruped": 2}

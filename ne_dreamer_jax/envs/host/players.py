@@ -6,6 +6,7 @@ A player is made by a factory without arguments and has ``described``, ``reset(s
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -137,8 +138,9 @@ class DmEnvPlayer:
         self._seeded = False
 
     def reset(self, seed: int | None) -> dict[str, np.ndarray]:
-        """Begins an episode. The seed reaches environments whose task has a ``random``, as those of dm_control."""
-        random = getattr(getattr(self._env, "task", None), "random", None)
+        """Begins an episode. The seed reaches dm_control's environments, of its suite and of its composer."""
+        suites = getattr(getattr(self._env, "task", None), "random", None)
+        random = suites if suites is not None else getattr(self._env, "random_state", None)
         if seed is not None and isinstance(random, np.random.RandomState):
             random.seed(seed % 2**32)
         return self._observe(self._env.reset().observation)
@@ -159,7 +161,8 @@ class DmEnvPlayer:
         self._env.close()
         physics = getattr(self._env, "physics", None)
         if physics is not None:
-            physics.free()
+            with contextlib.suppress(ReferenceError):  # of a composer's environment it is gone already
+                physics.free()
 
     def _render(self) -> np.ndarray:
         physics = getattr(self._env, "physics", None)
