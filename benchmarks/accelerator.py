@@ -35,8 +35,8 @@ def _set(*assignments: str) -> tuple[str, ...]:
     return tuple(word for assignment in assignments for word in ("--set", f"agent.{assignment}"))
 
 
-def _update(size: str, dtype: str, seconds: float, *more: str) -> Stage:
-    arguments = ("--size", size, "--rounds", "5", *more, *_set(f"compute_dtype={dtype}"))
+def _update(size: str, dtype: str, seconds: float) -> Stage:
+    arguments = ("--size", size, "--rounds", "5", "--no-parts", *_set(f"compute_dtype={dtype}"))
     smallest = ("--size", "1m", "--rounds", "1", "--no-parts", *_set(f"compute_dtype={dtype}", *TINY))
     return Stage(f"an update, {size}, {dtype}", "train_step", arguments, smallest, seconds)
 
@@ -49,8 +49,8 @@ def _rollout(name: str, *arguments: str) -> Stage:
 
 
 STAGES = (
-    _update("12m", "float32", 60, "--no-parts"),
-    _update("12m", "bfloat16", 60, "--no-parts"),
+    _update("12m", "float32", 60),
+    _update("12m", "bfloat16", 60),
     Stage("losses beside the CPU's", "agreement", ("--size", "1m"), ("--updates", "2", *_set(*TINY)), 60),
     Stage(
         "a chunk's shares", "loop", ("--task", "dmc/walker_walk", "--size", "12m"),
@@ -62,8 +62,8 @@ STAGES = (
         "seeds at once", "seeds", ("--seeds", "1", "--seeds", "8"),
         ("--seeds", "2", "--rounds", "1", *_set(*TINY)), 60,
     ),
-    _update("50m", "bfloat16", 60, "--no-parts"),
-    _update("200m", "bfloat16", 90, "--no-parts"),
+    _update("50m", "bfloat16", 60),
+    _update("200m", "bfloat16", 90),
     Stage(
         "Rooms", "rooms", ("--task", "rooms/watermaze", "--rounds", "3"),
         ("--task", "rooms/watermaze", "--envs", "2", "--pictures", "4", "--rounds", "1"), 40,
@@ -72,8 +72,14 @@ STAGES = (
         "methods", "methods", ("--size", "12m"),
         ("--size", "1m", "--method", "dreamer_no_reconstruction", "--rounds", "1"), 120,
     ),
-    Stage("an image's place", "storage", (), ("--rows", "8", "--rounds", "1"), 30),
-    _update("12m", "float32", 120),
+    Stage(
+        "an image's place", "storage", (),
+        ("--rows", "8", "--batch-size", "2", "--batch-length", "4", "--rounds", "1"), 30,
+    ),
+    Stage(
+        "an update's parts, 12m, float32", "train_step", ("--size", "12m", "--rounds", "5"),
+        ("--size", "1m", "--rounds", "1", *_set(*TINY)), 120,
+    ),
     Stage("memory", "memory", ("--no-compile",), ("--no-compile", "--size", "1m"), 20),
 )  # fmt: skip
 
@@ -81,7 +87,9 @@ STAGES = (
 @click.command(context_settings={"max_content_width": 110})
 @click.option("--output", type=UserPath(), required=True, help="A new folder: each stage's output and results.jsonl.")
 @click.option("--minutes", type=click.FloatRange(0, min_open=True), default=9.0, show_default=True, help="In all.")
-@click.option("--smallest", is_flag=True, help="Everything as small as it goes, to see that it runs; on a CPU, too.")
+@click.option(
+    "--smallest", is_flag=True, help="All as small as it goes and however long it takes, to see that it runs."
+)
 def main(output: Path, minutes: float, smallest: bool) -> None:
     """Run the benchmarks that tell of an accelerator, the most important first, and keep what they print."""
     try:
@@ -96,37 +104,39 @@ def main(output: Path, minutes: float, smallest: bool) -> None:
         if left < stage.seconds and not smallest:
             told.append(f"{stage.name}: left out, {left:.0f} s are left and {stage.seconds:.0f} are needed")
         else:
-            told.append(_run(stage, output, f"{number:02}", smallest, max(left, 1.0)))
+            told.append(_run(stage, output, f"{number:02}", smallest, None if smallest else left))
         say(told[-1])
     failed = [line for line in told if ": failed" in line]
     say(f"{len(told) - len(failed)} of {len(told)} stages are done or left out; their figures are in {output}")
     raise SystemExit(1 if failed else 0)
 
 
-def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float) -> str:
+def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float | None) -> str:
     """Runs a stage, stores what it prints, and says how it went."""
     arguments = stage.smallest if smallest else stage.arguments
     command = [sys.executable, "-m", f"benchmarks.{stage.module}", *arguments]
-    begin = time.monotonic()
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds)
-    except subprocess.TimeoutExpired:
-        return f"{stage.name}: failed, it took longer than the {seconds:.0f} s that were left"
-    taken = time.monotonic() - begin
-    text = f"$ python -m benchmarks.{stage.module} {' '.join(arguments)}\n{done.stdout}{done.stderr}"
-    (output / f"{number}_{stage.module}.txt").write_text(text, encoding="utf-8")
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["nothing said"])[-1]
-        return f"{stage.name}: failed with exit code {done.returncode} after {taken:.0f} s: {last}"
+    begin, file = time.monotonic(), output / f"{number}_{stage.module}.txt"
+    with file.open("w", encoding="utf-8") as printed:
+        printed.write(f"$ python -m benchmarks.{stage.module} {' '.join(arguments)}\n")
+        printed.flush()
+        try:
+            code = subprocess.run(
+                command, stdout=printed, stderr=subprocess.STDOUT, check=False, timeout=seconds
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return f"{stage.name}: failed, it took longer than the {seconds:.0f} s that were left"
+    taken, lines = time.monotonic() - begin, file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    if code:
+        return f"{stage.name}: failed with exit code {code} after {taken:.0f} s: {lines[-1]}"
     with (output / "results.jsonl").open("a", encoding="utf-8") as results:
-        for line in _results(done.stdout.splitlines()):
+        for line in _results(lines):
             results.write(json.dumps({"stage": stage.name, "seconds_in_all": taken, **line}) + "\n")
     return f"{stage.name}: done in {taken:.0f} s"
 
 
 def _results(lines: Sequence[str]) -> list[dict[str, Any]]:
     """The JSON lines that benchmarks print for programs."""
-    return [json.loads(line) for line in lines if line.startswith("{")]
+    return [json.loads(line) for line in lines if line.startswith('{"benchmark"')]
 
 
 if __name__ == "__main__":

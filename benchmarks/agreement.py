@@ -33,10 +33,16 @@ def main(size: str, method: str, updates: int, assignments: tuple[str, ...]) -> 
     with refusing(ValueError):
         run = configure(size, method, assignments)
     accelerator = jax.default_backend()
+    try:
+        cpu = jax.local_devices(backend="cpu")[0]
+    except RuntimeError as error:
+        raise click.UsageError(
+            "expected JAX's cpu platform beside the accelerator's, as JAX_PLATFORMS=cuda,cpu"
+        ) from error
     with traced_for("cuda" if accelerator == "cpu" else accelerator):
         here = _losses(run, updates, jax.devices()[0])
     with traced_for("cpu"):
-        there = _losses(run, updates, jax.local_devices(backend="cpu")[0])
+        there = _losses(run, updates, cpu)
     rows: list[dict[str, Any]] = []
     for name in sorted(here[0]):
         a, b = (np.array([losses[name] for losses in each]) for each in (here, there))

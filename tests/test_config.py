@@ -50,7 +50,11 @@ def test_presets_build_at_every_size_and_survive_json(name):
             share = 2 if name == "rooms_small" else 1
             assert config.agent.rssm.deter == configs.SIZES[size]["deter"] // share
             assert config.agent.heads.units == config.agent.encoder.units == configs.SIZES[size]["units"]
-    make_agent(configs.preset(name).agent, tiny.VECTORS)
+    config = configs.preset(name)
+    make_agent(config.agent, tiny.VECTORS)
+    side = config.env.image_size
+    pictures = EnvSpec({"image": ArraySpec((side, side, 3), jnp.dtype("uint8"))}, tiny.VECTORS.action)
+    jax.eval_shape(make_agent(config.agent, pictures).init, jax.random.key(0))
 
 
 ABLATIONS = [name for name in names.METHODS if name.startswith("ne_dreamer")]

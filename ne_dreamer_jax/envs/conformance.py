@@ -97,11 +97,13 @@ def findings(
     check_env(env)
     report = _Report()
     if isinstance(env, VectorEnv):
+        before = env.host.failure if env.host is not None else None
         try:
             _check_vector(env, report, key, num_envs, 2 * num_steps + beginning_steps, echo)
         except Exception as error:
             failure = env.host.failure if env.host is not None else None
-            report.add("prepare or step", "error", "environments that can be stepped", failure or _first_line(error))
+            why = failure if failure is not None and failure != before else _first_line(error)
+            report.add("prepare or step", "error", "environments that can be stepped", why)
         return list(report.found.values())
     echo("Looking at shapes and dtypes.")
     try:

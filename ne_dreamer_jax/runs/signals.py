@@ -30,7 +30,7 @@ class Stop:
 
     def __init__(self, echo: Callable[[str], None]) -> None:
         self.signal: int | None = None
-        self._asked = 0.0  # when, by the monotonic clock
+        self._twice = False  # whether a second one has come, as the watcher has it
         self._echo = echo
 
     def __enter__(self) -> Stop:
@@ -57,11 +57,11 @@ class Stop:
     def _ask(self, number: int, _: FrameType | None) -> None:
         """In the main thread, as soon as it runs Python again."""
         if self.signal is not None:
-            if time.monotonic() - self._asked > TOGETHER:
+            if self._is_second():
                 signal.signal(number, self._before[signal.Signals(number)])
                 signal.raise_signal(number)
             return
-        self.signal, self._asked = number, time.monotonic()
+        self.signal = number
         if signal.SIGHUP in self._before:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with contextlib.suppress(RuntimeError):  # it came in the middle of another line
@@ -69,15 +69,27 @@ class Stop:
                 "\nStopping when this chunk is done, to save a checkpoint. A second time stops at once, without."
             )
 
+    def _is_second(self) -> bool:
+        """Whether a signal is a second wish: by when it came, which the watcher knows, not by when it is heard here."""
+        for _ in range(20):
+            if self._twice:
+                return True
+            time.sleep(0.005)  # the watcher may not have been told yet
+        return False
+
     def _watch(self) -> None:
         """In a thread of its own, which hears of signals while the main thread is in a library."""
         first: float | None = None
         while received := self._woken.recv(16):
             for number in received:
-                if number not in self._before or number == signal.SIGHUP:
+                if number not in self._before:
                     continue
                 now = time.monotonic()
-                first = now if first is None else first
+                if first is None:
+                    first = now
+                if number == signal.SIGHUP or now - first <= TOGETHER:
+                    continue
+                self._twice = True
                 typed = number == signal.SIGINT and hasattr(sys, "ps1")
-                if now - first > TOGETHER and not typed and not self._over.wait(GRACE):
+                if not typed and not self._over.wait(GRACE):
                     os._exit(128 + number)

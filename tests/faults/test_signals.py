@@ -88,9 +88,9 @@ import os, signal, time
 from ne_dreamer_jax.runs.signals import Stop
 
 with Stop(lambda line: None) as stop:
-    for pause in (0.02, 2.0):
+    for _ in range(2):
         os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(pause)
+    time.sleep(1.0)
     print("goes on", stop.signal, flush=True)
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(5)

@@ -29,11 +29,14 @@ class Made:
 def _gymnasium(task: str, options: Options) -> Player:
     import gymnasium
 
-    module, colon, name = task.rpartition(":")
-    factory = getattr(_imported(module, f"gym:{task}"), name, None) if colon else None
-    if callable(factory):
-        return GymnasiumPlayer(factory(), options)
     names.register_installed()
+    module, colon, name = task.rpartition(":")
+    if colon:
+        factory = getattr(_imported(module, f"gym:{task}"), name, None)
+        if name not in gymnasium.registry:
+            if not callable(factory):
+                raise ValueError(f"gym:{task}: expected an environment that {module} registers, or a function of it")
+            return GymnasiumPlayer(factory(), options)
     drawn = None if options.observe == "own" else "rgb_array"
     return GymnasiumPlayer(gymnasium.make(task, render_mode=drawn), options)
 
