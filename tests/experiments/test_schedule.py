@@ -2,12 +2,13 @@
 
 import os
 import signal
+import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ne_dreamer_jax.runs import progress
+from ne_dreamer_jax.runs import progress, signals
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.runs.signals import Stop
@@ -86,6 +87,7 @@ def test_one_signal_asks_and_the_second_insists():
         os.kill(os.getpid(), signal.SIGINT)
         assert stop.signal == signal.SIGINT
         assert "Stopping" in said[0]
+        time.sleep(2 * signals.TOGETHER)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before

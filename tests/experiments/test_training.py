@@ -237,6 +237,7 @@ def hang_up(_line):
 
 @pytest.mark.strict
 def test_a_terminal_that_is_closed_stops_the_run_where_it_can_go_on(finished, tmp_path, monkeypatch):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
     code, lines = train(tmp_path, hang_up, "env step 48")
     assert code == 128 + signal.SIGHUP
     assert "The same command goes on" in lines[-1]
