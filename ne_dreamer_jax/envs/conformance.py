@@ -100,7 +100,7 @@ def findings(
         before = env.host.failure if env.host is not None else None
         try:
             _check_vector(env, report, key, num_envs, 2 * num_steps + beginning_steps, echo)
-        except Exception as error:
+        except jax.errors.JaxRuntimeError as error:  # what the host raised
             failure = env.host.failure if env.host is not None else None
             why = failure if failure is not None and failure != before else _first_line(error)
             report.add("prepare or step", "error", "environments that can be stepped", why)

@@ -135,7 +135,6 @@ class DmEnvPlayer:
         step = getattr(env, "control_timestep", None)
         seconds = float(step()) * options.action_repeat if callable(step) else None
         self.described = Described(self._observe.specs, size, discrete, seconds)
-        self._seeded = False
 
     def reset(self, seed: int | None) -> dict[str, np.ndarray]:
         """Begins an episode. The seed reaches dm_control's environments, of its suite and of its composer."""
