@@ -99,8 +99,12 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
     def encoder(p: Any) -> Any:
         return jnp.sum(jnp.square(nets.apply("encoder", p, batch.obs)))
 
+    uniform = jax.random.uniform(key, (*batch.is_first.shape, config.rssm.stoch))
+
     def posterior_scan(p: Any, embedding: Any) -> Any:
-        latent, _ = observe(nets.rssm, p["rssm"], key, batch.context, embedding, rollout.prev_action, batch.is_first)
+        latent, _ = observe(
+            nets.rssm, p["rssm"], uniform, batch.context, embedding, rollout.prev_action, batch.is_first
+        )
         return jnp.sum(jnp.square(feature(latent)))
 
     def predictions(p: Any, rollout: Any) -> Any:
@@ -117,7 +121,8 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
 
     def imagined(p: Any, start: Any) -> Any:
         # As in the update, little is kept of the states.
-        return behavior.imagine(nets, p, key, start, config.behavior.horizon, lambda state: state[:, 0])
+        noise = behavior.imagination_noise(nets, key, start.deter.shape[0], config.behavior.horizon)
+        return behavior.imagine(nets, p, noise, start, lambda state: state[:, 0])
 
     start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
     compiled = {

@@ -6,7 +6,7 @@ Each part's dataclass lives beside the code that reads it; this module composes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from ne_dreamer_jax.nets.encoder import EncoderConfig
 from ne_dreamer_jax.nets.heads import HeadsConfig
 from ne_dreamer_jax.nets.predictor import PredictorConfig
 from ne_dreamer_jax.nets.rssm import RSSMConfig
-from ne_dreamer_jax.objectives import AnyObjective, NextEmbedding
+from ne_dreamer_jax.objectives import AnyObjective, DreamerPro, NextEmbedding, SameStep
 from ne_dreamer_jax.settings import did_you_mean, names, ranges
 from ne_dreamer_jax.settings.ranges import LARGEST, Range
 
@@ -142,11 +142,26 @@ def released_code(size: str) -> Config:
         base,
         heads=replace(base.heads, clip_actions=False),
         world_model=WorldModelConfig(kl_unimix=0.0),
-        behavior=BehaviorConfig(discount_in_head=False),
-        objective=NextEmbedding(action="previous", masked=False, across_episodes=True),
-        optimizer=OptimizerConfig(name="laprop"),
+        behavior=BehaviorConfig(discount=1 - 1 / 333, discount_in_head=False, percentile_method="nearest"),
+        objective=NextEmbedding(
+            PredictorConfig(discrete_action="normalised", attention_init="xavier"),
+            sample_deviation=True,
+            action="previous",
+            masked=False,
+            across_episodes=True,
+            unshifted_token="state",
+        ),
+        optimizer=OptimizerConfig(name="laprop_weighted"),
     )
-    return Config(agent=agent, loop=LoopConfig(capacity=500_000, write_latents=False, prefill=1_056))
+    loop = LoopConfig(
+        env_steps=1_010_000,
+        capacity=500_000,
+        write_latents=False,
+        prefill=1_056,
+        eval_every=10_000,
+        eval_episodes=8,
+    )
+    return Config(agent=agent, loop=loop)
 
 
 PRESETS = {
@@ -159,6 +174,15 @@ PRESETS = {
 }
 
 
+RELEASED: tuple[AnyObjective, ...] = (
+    SameStep(sample_deviation=True),
+    DreamerPro(whole_shifts=True, projection_init="uniform"),
+)
+"""Objectives of the released code's other methods, where they are not what their own authors say."""
+OBJECTIVES = {"released_code": RELEASED}
+"""Preset -> objectives of other methods than its own that are not the defaults."""
+
+
 def preset(name: str, size: str | None = None) -> Config:
     """A named setting, at one of `SIZES` (default: the preset's own). Raises ValueError naming close matches."""
     _check("preset", name, PRESETS)
@@ -166,7 +190,7 @@ def preset(name: str, size: str | None = None) -> Config:
     return build(size or default)
 
 
-def with_method(config: Config, method: str) -> Config:
+def with_method(config: Config, method: str, known: Sequence[AnyObjective] = ()) -> Config:
     """The config with another of the paper's methods; what the methods share stays as the config has it.
 
     Settings that made an ablation of the config's method are put back to their defaults, which may be others than a
@@ -178,6 +202,9 @@ def with_method(config: Config, method: str) -> Config:
     where the config has the paper's. It learns as often for each agent step as the config's agent (in the paper's
     setting every second step, as published), and from no more steps at once, nor begins later, than that.
 
+    Args:
+      known: objectives to start from in place of their defaults, such as a preset's in `OBJECTIVES`.
+
     Raises:
       ValueError: an unknown method, or a world-model method for a config that has no world model to begin with.
     """
@@ -188,7 +215,7 @@ def with_method(config: Config, method: str) -> Config:
         raise ValueError(f"expected a config of a world-model method to make {method} of, got drqv2; take the preset's")
     if method == names.DRQV2:
         return _drqv2(config, config.agent)
-    return _with_objective(config, config.agent, _objective(method, config.agent.objective))
+    return _with_objective(config, config.agent, _objective(method, (config.agent.objective, *known)))
 
 
 def override(config: Config, assignment: str) -> Config:
@@ -234,11 +261,12 @@ def _drqv2(config: Config, shared: AgentConfig) -> Config:
     return replace(config, env=env, agent=agent, loop=loop)
 
 
-def _objective(method: str, current: AnyObjective) -> AnyObjective:
-    """A world-model method's objective, with the settings of the current one where it is of the same kind."""
+def _objective(method: str, known: Iterable[AnyObjective]) -> AnyObjective:
+    """A world-model method's objective, with the settings of the first of those given that is of the same kind."""
     base, _, ablation = method.partition("/")
     kind = getattr(objectives, names.OBJECTIVES[base])
-    objective, ablations = current if type(current) is kind else kind(), names.ABLATIONS.get(base, {})
+    objective = next((each for each in known if type(each) is kind), kind())
+    ablations = names.ABLATIONS.get(base, {})
     defaults, now = settings.paths(kind()), settings.paths(objective)
     values = {path: defaults[path] for path, ablated in ablations.values() if now[path] == ablated}
     values |= dict([ablations[ablation]] if ablation else [])

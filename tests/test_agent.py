@@ -1,6 +1,7 @@
 """The agent as a whole: what it refuses, what one update changes, how it acts, and how many parameters it has."""
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import jax
@@ -12,6 +13,7 @@ from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
+from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
@@ -242,6 +244,7 @@ def test_acting_refuses_an_unknown_mode_and_other_observations():
             {"compute_dtype": "float16"},
             r"compute_dtype: expected float32 or bfloat16, got 'float16'",
         ),
+        ({"microbatches": 3}, r"agent.microbatches: expected a divisor of agent.batch_size 2 \(1, 2\), got 3"),
         ({"batch_length": 9}, "Sequences of 9 steps, but the predictor has positions for 8"),
         (
             {"objective": REPLACE(tiny.CONFIG.objective, shift=5)},
@@ -309,6 +312,30 @@ def test_the_update_of_every_method_keeps_the_state_as_it_is_made(method, dtype)
     new, _, metrics = agent.train_step.eval_shape(state, jax.eval_shape(tiny.batch))
     assert jax.tree.map(lambda x: (x.shape, x.dtype), new) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert {f"loss/{name}" for name in config.loss_scales} <= set(metrics)
+
+
+OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in tiny.OBJECTIVES if name != "ne_dreamer"]
+
+
+@pytest.mark.parametrize("gradient", ["reinforce", pytest.param("dynamics", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["ne_dreamer", *OTHERS])
+def test_an_update_in_microbatches_is_the_update(method, gradient):
+    """Losses, latents and gradients: an optimiser whose steps are a tenth of the gradients, for small ones."""
+    plain = OptimizerConfig(learning_rate=1.0, eps=10.0, agc=math.inf, warmup=0)
+    config = REPLACE(tiny.with_method(tiny.OBJECTIVES[method]), optimizer=plain, batch_size=4)
+    config = REPLACE(config, behavior=REPLACE(config.behavior, gradient=gradient))
+    batch = tiny.batch(tiny.BOTH, (4, 5))
+
+    def updated(count):
+        agent = make_agent(REPLACE(config, microbatches=count), tiny.BOTH)
+        state = tiny.state(agent)
+        before = jax.tree.map(np.asarray, state.params)
+        state, latents, metrics = agent.train_step(state, batch)
+        return jax.tree.map(lambda a, b: 10 * (np.asarray(a) - b), state.params, before), latents, metrics
+
+    want = updated(1)
+    for (path, x), y in zip(jax.tree.leaves_with_path(updated(2)), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4, err_msg=jax.tree_util.keystr(path))
 
 
 @pytest.mark.slow

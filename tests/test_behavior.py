@@ -41,7 +41,8 @@ def make(spec, config):
 def frozen_trajectory(nets, params, rollout, key):
     """Every replayed state, what is imagined from it, and all features [H + 1, M, F]."""
     start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
-    imagined = behavior.imagine(nets, params, key, start, H)
+    noise = behavior.imagination_noise(nets, key, start.deter.shape[0], H)
+    imagined = behavior.imagine(nets, params, noise, start)
     return start, imagined, jnp.concatenate([imagined.seen, imagined.last[None]])
 
 

@@ -1,5 +1,6 @@
 """Presets and methods, and that no setting is without effect."""
 
+import itertools
 import json
 import typing
 from dataclasses import fields, replace
@@ -16,6 +17,7 @@ from ne_dreamer_jax.agents import drqv2, optim
 from ne_dreamer_jax.agents.dreamer import world_model
 from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
 from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
+from ne_dreamer_jax.commands import train
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import registry
 from ne_dreamer_jax.envs.config import DmcConfig
@@ -186,16 +188,37 @@ def test_the_released_code_differs_where_fidelity_says_so():
         "agent.objective.action": "previous",
         "agent.objective.masked": False,
         "agent.objective.across_episodes": True,
-        "agent.optimizer.name": "laprop",
+        "agent.objective.unshifted_token": "state",
+        "agent.objective.sample_deviation": True,
+        "agent.objective.predictor.discrete_action": "normalised",
+        "agent.objective.predictor.attention_init": "xavier",
+        "agent.behavior.percentile_method": "nearest",
+        "agent.optimizer.name": "laprop_weighted",
+        "loop.env_steps": 1_010_000,
+        "loop.eval_every": 10_000,
+        "loop.eval_episodes": 8,
         "loop.capacity": 500_000,
         "loop.write_latents": False,
         "loop.prefill": 1_056,
         "agent.behavior.discount_in_head": False,
+        "agent.behavior.discount": 1 - 1 / 333,
     }
     fidelity = (Path(__file__).parents[1] / "experiments" / "FIDELITY.md").read_text()
     for path in code:
         if paper[path] != code[path]:
             assert f"`{path}" in fidelity, path
+    for released in configs.RELEASED:
+        default = type(released)()
+        for path in settings.paths(released):
+            if settings.paths(default)[path] != settings.paths(released)[path]:
+                assert f"agent.objective.{path}" in fidelity, path
+
+
+@pytest.mark.parametrize("released", configs.RELEASED, ids=lambda x: type(x).__name__)
+def test_the_released_code_has_its_own_baselines(released):
+    method = names.method_of(released)
+    assert train.configure("released_code", None, method, {}).agent.objective == released != type(released)()
+    assert train.configure("dmc", None, method, {}).agent.objective == type(released)()
 
 
 @pytest.mark.parametrize(
@@ -254,6 +277,8 @@ CHANGES = {
         "predictor.feedforward": "8",
         "predictor.positions": "9",
         "predictor.projector": "false",
+        "predictor.discrete_action": "normalised",
+        "predictor.attention_init": "xavier",
         "shift": "0",
         "steps": "3",
         "step_discount": "0.9",
@@ -262,6 +287,8 @@ CHANGES = {
         "action": "previous",
         "masked": "false",
         "across_episodes": "true",
+        "sample_deviation": "true",
+        "unshifted_token": "state",
     },
     "agent.behavior": {
         "horizon": "2",
@@ -273,6 +300,7 @@ CHANGES = {
         "slow_scale": "0.5",
         "return_decay": "0.9",
         "return_percentiles": "10,95",
+        "percentile_method": "nearest",
         "return_floor": "2",
     },
     "agent.optimizer": {
@@ -288,6 +316,7 @@ CHANGES = {
     "agent": {
         "batch_size": "3",
         "batch_length": "6",
+        "microbatches": "2",
         "compute_dtype": "bfloat16",
         "objective": "SameStep",
         "behavior.slow_rate": "0.1",
@@ -311,6 +340,9 @@ CHANGES = {
     },
 }
 
+TOGETHER = {"agent.objective.unshifted_token": "agent.objective.shift=0"}
+"""Setting -> what must be set for it to mean anything."""
+
 
 def networks(config):
     """Initialisation and acting, of both kinds of policy."""
@@ -333,7 +365,7 @@ def rollout_of(nets):
     """A rollout made of zeros."""
     batch = tiny.batch(nets.spec)
     latent = tiny.latent((2, 5))
-    action = jnp.zeros((2, 5, 2))
+    action = jnp.zeros((2, 5, nets.spec.action.size))
     feature = jnp.zeros((2, 5, nets.feature))
     return Rollout(batch, jnp.zeros((2, 5, nets.embedding)), latent, feature, action, action + 1)
 
@@ -347,12 +379,17 @@ def world(config):
     yield program(losses, params)
 
 
-def objective(config, spec=tiny.VECTORS):
-    """The objective's parameters and loss."""
+def objective(config, *specs):
+    """The objective's parameters and loss, for continuous and discrete actions."""
+    for spec in specs or (tiny.VECTORS, tiny.DISCRETE):
+        yield from objective_for(config, spec)
+
+
+def objective_for(config, spec):
     nets = tiny.networks(spec, config.agent)
     functions = config.agent.objective.build(tiny.model(nets))
     params = {**jax.eval_shape(nets.init, KEY), "objective": jax.eval_shape(functions.init, KEY)}
-    yield str(params)
+    yield program(functions.init, KEY)
     target = jax.eval_shape(functions.init_target, params)
     yield program(functions.after_update, params, target, jnp.ones((), jnp.int32))
     rollout = rollout_of(nets)
@@ -417,7 +454,7 @@ PROBES = {
 
 # What the other objectives have of their own: one of the least size, and a change of every field.
 OBJECTIVES: dict[type, tuple] = {
-    SameStep: (SameStep(), {"redundancy": "0.1"}),
+    SameStep: (SameStep(), {"redundancy": "0.1", "sample_deviation": "true"}),
     Reconstruction: (Reconstruction(blocks=1), {"blocks": "2"}),
     NoObjective: (NoObjective(), {}),
     DreamerPro: (
@@ -431,6 +468,8 @@ OBJECTIVES: dict[type, tuple] = {
             "teacher_rate": "0.1",
             "frozen_updates": "5",
             "max_shift": "1",
+            "whole_shifts": "true",
+            "projection_init": "uniform",
             "warm_up": "2",
         },
     ),
@@ -470,8 +509,12 @@ def test_every_setting_changes_something(group):
 
     without_effect = []
     for name, value in CHANGES[group].items():
-        changed = configs.override(BASE, f"{group}.{name}={value}")
-        if all(text == before(i) for i, text in enumerate(PROBES[group](changed))):
+        together = TOGETHER.get(f"{group}.{name}")
+        origin = configs.override(BASE, together) if together else BASE
+        unchanged = itertools.count() if together is None else PROBES[group](origin)
+        of = before if together is None else lambda i, unchanged=unchanged: next(unchanged)
+        changed = configs.override(origin, f"{group}.{name}={value}")
+        if all(text == of(i) for i, text in enumerate(PROBES[group](changed))):
             without_effect.append(name)
     assert without_effect == []
 

@@ -8,7 +8,10 @@ import numpy as np
 import optax
 import pytest
 
+from ne_dreamer_jax.agents import optim
 from ne_dreamer_jax.agents.optim import OptimizerConfig, clip_per_tensor, make
+from ne_dreamer_jax.nets.rssm import PARTS_OF_ONE_TENSOR
+from tests import tiny
 
 PLAIN = {"agc": math.inf, "warmup": 0, "learning_rate": 0.01}
 
@@ -29,18 +32,24 @@ def run(config, params, gradients):
     return out
 
 
-def by_hand(name, params, gradients, lr=0.01, b1=0.9, b2=0.999, eps=1e-20):
+def by_hand(name, params, gradients, lr=0.01, b1=0.9, b2=0.999, eps=1e-20, warmup=1):
     m = v = np.zeros_like(params, np.float64)
-    params, out = params.astype(np.float64), []
+    counted = 0.0
+    params, out, full = params.astype(np.float64), [], lr
     for t, g in enumerate(np.asarray(gradients, np.float64), 1):
+        lr = full * min(1, t / warmup)
         v = b2 * v + (1 - b2) * g**2
         root = np.sqrt(v / (1 - b2**t)) + eps
         if name == "adam":
             m = b1 * m + (1 - b1) * g
             update = m / (1 - b1**t) / root
-        else:
+        elif name == "laprop":
             m = b1 * m + (1 - b1) * g / root
             update = m / (1 - b1**t)
+        else:
+            m = b1 * m + (1 - b1) * lr * g / root
+            counted = b1 * counted + (1 - b1) * lr
+            update = m / counted
         params = params - lr * update
         out.append(params)
     return out
@@ -58,7 +67,21 @@ def test_equals_hand_written_steps(name):
     assert np.abs(np.asarray(got[-1]) - other[-1]).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", ["adam", "laprop"])
+@pytest.mark.parametrize("warmup", [0, 5])
+def test_a_momentum_weighted_by_the_learning_rate_differs_while_that_rises(warmup):
+    rng = np.random.default_rng(0)
+    params, gradients = rng.normal(size=5).astype(np.float32), rng.normal(size=(8, 5)).astype(np.float32)
+    config = {**PLAIN, "warmup": warmup}
+    got, other = (
+        run(OptimizerConfig(name, **config), jnp.asarray(params), [jnp.asarray(g) for g in gradients])
+        for name in ("laprop_weighted", "laprop")
+    )
+    np.testing.assert_allclose(got, by_hand("laprop_weighted", params, gradients, warmup=max(warmup, 1)), rtol=1e-5)
+    largest = np.abs(np.asarray(got) - np.asarray(other)).max()
+    assert largest > 1e-3 if warmup else largest < 1e-6
+
+
+@pytest.mark.parametrize("name", ["adam", "laprop", "laprop_weighted"])
 def test_zero_and_tiny_gradients_give_no_nan(name):
     params = jnp.ones(4)
     zero, *rest = run(
@@ -84,6 +107,29 @@ def test_clipping_is_per_tensor_and_relative_to_its_norm():
     np.testing.assert_array_equal(got["large"], f32(gradients)["large"])
 
 
+def test_parts_of_one_tensor_are_clipped_by_the_norm_of_the_whole():
+    rng = np.random.default_rng(2)
+    gate, own, inputs, gradient = rng.normal(size=(4, 3, 5)).astype(np.float32)
+    tree = lambda a, b, c: {"rssm": {"gate_kernel": a, "state_kernel": b, "input_kernel": c}}
+    params, gradients = tree(gate, own, inputs), tree(9 * gradient, 9 * gradient, -9 * gradient)
+    transform = clip_per_tensor(0.3, 1e-3, optim.whole_tensor)
+    got, _ = transform.update(jax.tree.map(jnp.asarray, gradients), transform.init(params), params)
+    joined = clip_per_tensor(0.3, 1e-3)
+    kernel, grads = (
+        np.concatenate([t["rssm"][n] for n in ("state_kernel", "input_kernel")]) for t in (params, gradients)
+    )
+    want, _ = joined.update(jnp.asarray(grads), joined.init(kernel), kernel)
+    parts = np.concatenate([got["rssm"][n] for n in ("state_kernel", "input_kernel")])
+    np.testing.assert_allclose(parts, want, rtol=1e-5)
+    alone, _ = joined.update(jnp.asarray(9 * gradient), joined.init(gate), gate)
+    np.testing.assert_allclose(got["rssm"]["gate_kernel"], alone, rtol=1e-5)
+
+
+def test_the_names_of_parts_are_those_of_the_recurrence():
+    params = tiny.networks(tiny.VECTORS).init(jax.random.key(0))["rssm"]
+    assert set(PARTS_OF_ONE_TENSOR) < set(params)
+
+
 def test_clipping_comes_before_the_moments():
     """A spike that is clipped first leaves a second moment that forgets it."""
     params, gradients = jnp.ones(4), [jnp.full(4, 1e6), *([jnp.full(4, 1e-1)] * 3)]
@@ -106,7 +152,7 @@ def test_warmup_is_linear_and_then_over(warmup):
     np.testing.assert_allclose(steps, 0.5 * np.minimum(1, np.arange(1, 8) / max(warmup, 1)), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["adam", "laprop"])
+@pytest.mark.parametrize("name", ["adam", "laprop", "laprop_weighted"])
 def test_state_keeps_its_types_under_scan(name):
     params = {"w": jnp.ones((2, 3)), "b": jnp.zeros(3)}
     optimizer = make(OptimizerConfig(name))

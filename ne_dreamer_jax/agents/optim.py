@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from ne_dreamer_jax.nets.rssm import PARTS_OF_ONE_TENSOR
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import CountOrNone, Positive, Range, ShareBelowOne
 
@@ -18,8 +20,9 @@ from ne_dreamer_jax.settings.ranges import CountOrNone, Positive, Range, ShareBe
 class OptimizerConfig:
     """The defaults are the paper's table; warm-up and the floor of the clipping are DreamerV3's."""
 
-    name: Literal["adam", "laprop"] = "adam"
-    """laprop is what the authors' released code and DreamerV3 use."""
+    name: Literal["adam", "laprop", "laprop_weighted"] = "adam"
+    """laprop is what DreamerV3 uses; laprop_weighted, whose momentum weighs each step by its learning rate, what the
+    authors' released code and LaProp's own do."""
     learning_rate: Positive = 4e-5
     beta1: ShareBelowOne = 0.9
     beta2: ShareBelowOne = 0.999
@@ -35,25 +38,73 @@ class OptimizerConfig:
         ranges.check(self)
 
 
-def clip_per_tensor(clip: float, pmin: float) -> optax.GradientTransformation:
+Path = tuple[Any, ...]
+
+
+def clip_per_tensor(
+    clip: float, pmin: float, tensor: Callable[[Path], Hashable] = lambda path: path
+) -> optax.GradientTransformation:
     r"""Adaptive gradient clipping (Brock et al., 2021) with one norm a tensor, as DreamerV3 clips.
 
     Each gradient g of a parameter tensor :math:`\theta` becomes
     :math:`g / \max(1, \|g\| / (clip \cdot \max(pmin, \|\theta\|)))`. (``optax.adaptive_grad_clip`` compares the norms
     of each unit, which is another rule.)
+
+    Args:
+      clip: largest norm of a gradient, relative to its tensor's.
+      pmin: a tensor's norm counts as at least this.
+      tensor: path of a leaf -> which tensor it is of; leaves of one tensor share a norm. Default: each its own.
     """
 
     def update(updates, state, params=None):
         if params is None:
             raise ValueError("clipping relative to the parameters needs them: call update(gradients, state, params)")
-
-        def clipped(gradient: jax.Array, parameter: jax.Array) -> jax.Array:
-            limit = clip * jnp.maximum(jnp.linalg.norm(parameter.ravel()), pmin)
-            return gradient / jnp.maximum(jnp.linalg.norm(gradient.ravel()) / limit, 1.0)
-
-        return jax.tree.map(clipped, updates, params), state
+        leaves, structure = jax.tree.flatten_with_path(updates)
+        tensors: dict[Hashable, list[tuple[jax.Array, jax.Array]]] = {}
+        for (path, gradient), parameter in zip(leaves, jax.tree.leaves(params), strict=True):
+            tensors.setdefault(tensor(path), []).append((gradient, parameter))
+        divisors = {}
+        for name, parts in tensors.items():
+            gradients, parameters = zip(*parts, strict=True)
+            limit = clip * jnp.maximum(optax.tree.norm(parameters), pmin)
+            divisors[name] = jnp.maximum(optax.tree.norm(gradients) / limit, 1.0)
+        clipped = [gradient / divisors[tensor(path)] for path, gradient in leaves]
+        return jax.tree.unflatten(structure, clipped), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
+
+
+def whole_tensor(path: Path) -> Path:
+    """The tensor of the published networks that a leaf of ours is part of (`rssm.PARTS_OF_ONE_TENSOR`)."""
+    names: list[Any] = [getattr(entry, "key", entry) for entry in path]
+    return tuple(PARTS_OF_ONE_TENSOR.get(name, name) for name in names)
+
+
+class WeightedAverage(NamedTuple):
+    """State of `weighted_ema`."""
+
+    updates: jax.Array  # int32 []
+    weight: jax.Array  # float32 [], average of the weights so far
+    mean: Any  # like the updates, average of weight times update
+
+
+def weighted_ema(decay: float, weight: Callable[[jax.Array], jax.Array]) -> optax.GradientTransformation:
+    r"""Exponential moving average in which step t counts ``weight(t)`` times: :math:`\overline{w u} / \overline w`.
+
+    Bias-corrected by its own weights; with constant ones it is ``optax.ema``.
+    """
+
+    def init(params):
+        zero = jnp.zeros(())
+        return WeightedAverage(jnp.zeros((), jnp.int32), zero, jax.tree.map(jnp.zeros_like, params))
+
+    def update(updates, state, params=None):
+        now = weight(state.updates)
+        average = lambda old, new: decay * old + (1 - decay) * now * new
+        mean, total = jax.tree.map(average, state.mean, updates), average(state.weight, 1.0)
+        return jax.tree.map(lambda m: m / total, mean), WeightedAverage(state.updates + 1, total, mean)
+
+    return optax.GradientTransformation(init, update)
 
 
 def make(config: OptimizerConfig) -> optax.GradientTransformation:
@@ -62,27 +113,31 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
     Both rules keep bias-corrected averages m and v of first and second moments. Adam's update is
     :math:`m(g) / (\sqrt{v(g^2)} + \epsilon)`; LaProp (Ziyin et al., 2020) averages the normalised gradient instead,
     :math:`m(g / (\sqrt{v(g^2)} + \epsilon))`. Update number u (from 0) is taken with the learning rate times
-    min(1, (u + 1) / warmup).
+    min(1, (u + 1) / warmup); in LaProp's own code a normalised gradient counts in m by the learning rate of its update,
+    which is another average while that rises (``laprop_weighted``).
 
     With the default epsilon only gradients that are exactly zero, or whose squares underflow in float32 (below about
     1e-18), feel it; zero gradients give zero updates.
     """
     b1, b2, eps = config.beta1, config.beta2, config.eps
-    rules = {
-        "adam": lambda: optax.scale_by_adam(b1, b2, eps),
-        "laprop": lambda: optax.chain(
-            optax.scale_by_rms(b2, eps, eps_in_sqrt=False, bias_correction=True), optax.ema(b1)
-        ),
-    }
+
+    def ramp(update: jax.Array) -> jax.Array:
+        return jnp.minimum((update.astype(jnp.float32) + 1.0) / max(config.warmup, 1), 1.0)
 
     def learning_rate(update: jax.Array) -> jax.Array:
-        ramp = (update.astype(jnp.float32) + 1.0) / max(config.warmup, 1)
-        return config.learning_rate * jnp.minimum(ramp, 1.0)
+        return config.learning_rate * ramp(update)
+
+    normalised = lambda: optax.scale_by_rms(b2, eps, eps_in_sqrt=False, bias_correction=True)
+    rules = {
+        "adam": lambda: optax.scale_by_adam(b1, b2, eps),
+        "laprop": lambda: optax.chain(normalised(), optax.ema(b1)),
+        "laprop_weighted": lambda: optax.chain(normalised(), weighted_ema(b1, ramp)),
+    }
 
     # Only the clipping needs to know the tensors. The rest runs on one flat vector: a dozen kernels instead of several
     # for each of a hundred tensors, which halves the optimiser's compile time and its launches on a GPU.
     chain = optax.chain(
-        clip_per_tensor(config.agc, config.agc_pmin),
+        clip_per_tensor(config.agc, config.agc_pmin, whole_tensor),
         optax.flatten(optax.chain(rules[config.name](), optax.scale_by_learning_rate(learning_rate))),
     )
 

@@ -213,7 +213,7 @@ def configure(
     if (task := values.get("env.task")) is not None:  # before the method: drqv2's authors chose some settings by task
         config = presets.override(config, f"env.task={task}")
     if method is not None:
-        config = presets.with_method(config, method)
+        config = presets.with_method(config, method, presets.OBJECTIVES.get(preset, ()))
     if values.get("env.obs") is not None and not hasattr(config.env, "obs"):
         raise ValueError(f"--obs: {config.env.task} says itself how it is observed; expected a dmc/ task for it")
     for path, value in values.items():

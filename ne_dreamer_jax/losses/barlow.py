@@ -14,6 +14,7 @@ def barlow_twins(
     mask: jax.Array | None = None,
     redundancy: float = 5e-4,
     eps: float = 1e-8,
+    sample_deviation: bool = False,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     r"""Redundancy-reduction loss between two sets of paired vectors.
 
@@ -33,6 +34,8 @@ def barlow_twins(
         whatever they hold.
       redundancy: :math:`\lambda`.
       eps: added to each variance, so that a constant dimension correlates with nothing instead of giving NaN.
+      sample_deviation: standardise by the sample's standard deviation (N - 1), to which ``eps`` is added, as the
+        authors' released code does: with perfect predictions :math:`C_{ii}` is then 1 - 1/N.
 
     Returns:
       The loss, float32 ``[]``, and metrics without gradient: ``diagonal`` (mean of :math:`C_{ii}`), ``off_diagonal``
@@ -58,8 +61,12 @@ def barlow_twins(
         x = jnp.where(included, x.reshape(-1, size).astype(jnp.float32), 0.0)
         mean = jnp.sum(x, axis=0, keepdims=True) / count
         centred = jnp.where(included, x - mean, 0.0)
-        variance = jnp.sum(jnp.square(centred), axis=0, keepdims=True) / count
-        return centred * jax.lax.rsqrt(variance + eps)
+        squares = jnp.sum(jnp.square(centred), axis=0, keepdims=True)
+        if not sample_deviation:
+            return centred * jax.lax.rsqrt(squares / count + eps)
+        variance = squares / jnp.maximum(count - 1.0, 1.0)
+        varies = variance > 0.0  # the root's gradient at zero is infinite
+        return centred / (jnp.where(varies, jnp.sqrt(jnp.where(varies, variance, 1.0)), 0.0) + eps)
 
     # TensorFloat-32 would leave three digits of a correlation, hence the precision. Dividing a factor by N instead of
     # the product spares a second E x E array.
@@ -84,6 +91,7 @@ def next_embedding_loss(
     shift: int = 1,
     masked: bool = True,
     align: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
+    sample_deviation: bool = False,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     r"""Next-embedding predictive alignment, :math:`L_{NE}`: `barlow_twins` between predictions and later embeddings.
 
@@ -104,6 +112,7 @@ def next_embedding_loss(
       shift: k >= 0. 1 is the paper's loss; 0 its ablation "w/o shift", where every step counts.
       masked: False counts every pair, also those across two episodes, as the authors' released code does.
       align: (prediction, target, mask) -> loss and metrics, in place of `barlow_twins`; such as `cosine_alignment`.
+      sample_deviation: as for `barlow_twins`.
 
     Returns:
       As `barlow_twins`, or as ``align``.
@@ -125,6 +134,7 @@ def next_embedding_loss(
         episode = jnp.cumsum(is_first.astype(jnp.int32), axis=1)  # the same number on all steps of an episode
         mask = episode[:, : length - shift] == episode[:, shift:]
     target = jax.lax.stop_gradient(embedding[:, shift:])
+    pairs = predicted[:, : length - shift], target, mask
     if align is not None:
-        return align(predicted[:, : length - shift], target, mask)
-    return barlow_twins(predicted[:, : length - shift], target, mask, redundancy)
+        return align(*pairs)
+    return barlow_twins(*pairs, redundancy, sample_deviation=sample_deviation)

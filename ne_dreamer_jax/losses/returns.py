@@ -74,6 +74,7 @@ def update_percentiles(
     returns: jax.Array,
     decay: float = 0.99,
     percentiles: tuple[float, float] = (5.0, 95.0),
+    method: str = "linear",
 ) -> tuple[jax.Array, jax.Array]:
     """Exponential moving averages of two percentiles of the returns: ``decay * old + (1 - decay) * new``.
 
@@ -84,7 +85,8 @@ def update_percentiles(
       high: float32 ``[]``, of the upper one.
       returns: any shape; receives no gradient.
       decay: of the averages.
-      percentiles: lower and upper, in percent, linearly interpolated.
+      percentiles: lower and upper, in percent.
+      method: what a percentile between two returns is: ``"linear"`` interpolates, ``"nearest"`` takes the nearer one.
 
     Returns:
       The new ``(low, high)``.
@@ -92,7 +94,11 @@ def update_percentiles(
     Source: DreamerV3, "return normalization".
     """
     fractions = jnp.asarray(percentiles, jnp.float32) / 100.0
-    now = jnp.quantile(jax.lax.stop_gradient(returns).astype(jnp.float32), fractions)
+    returns = jax.lax.stop_gradient(returns).astype(jnp.float32)
+    if method == "nearest":
+        now = jnp.sort(returns.ravel())[jnp.round(fractions * (returns.size - 1)).astype(jnp.int32)]
+    else:
+        now = jnp.quantile(returns, fractions, method=method)
     return decay * low + (1.0 - decay) * now[0], decay * high + (1.0 - decay) * now[1]
 
 

@@ -71,16 +71,17 @@ class Linear(nn.Module):
 
     units: int
     use_bias: bool = True
-    scale: float = 1.0
+    kernel_init: initializers.Initializer = kernel_init()
     dtype: Any = jnp.float32
+    bias_init: initializers.Initializer = initializers.zeros_init()
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        kernel = self.param("kernel", kernel_init(self.scale), (x.shape[-1], self.units), jnp.float32)
+        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.units), jnp.float32)
         product = x.astype(self.dtype) @ kernel.astype(self.dtype)
         if not self.use_bias:
             return product
-        bias = self.param("bias", initializers.zeros_init(), (self.units,), jnp.float32).astype(self.dtype)
+        bias = self.param("bias", self.bias_init, (self.units,), jnp.float32).astype(self.dtype)
         return product + jnp.expand_dims(bias, range(product.ndim - 1))
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import unimix_logits
-from ne_dreamer_jax.nets.blocks import MLP, Linear
+from ne_dreamer_jax.nets.blocks import MLP, Linear, kernel_init
 from ne_dreamer_jax.nets.rssm import sample_onehot
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, NonNegative, Positive, Range, Share, Width
@@ -59,7 +59,8 @@ class Head(nn.Module):
     @nn.compact
     def __call__(self, feature: Array) -> Array:
         x = MLP(self.layers, self.units, self.dtype, name="mlp")(feature)
-        return Linear(self.outputs, scale=self.scale, dtype=self.dtype, name="out")(x).astype(jnp.float32)
+        out = Linear(self.outputs, kernel_init=kernel_init(self.scale), dtype=self.dtype, name="out")
+        return out(x).astype(jnp.float32)
 
 
 def reward_head(c: HeadsConfig, dtype: Any) -> Head:
@@ -95,7 +96,11 @@ class BoundedNormal:
 
     def sample(self, key: Array) -> Array:
         """Raw, reparametrised sample [..., A]."""
-        return self.mean + self.std * jax.random.normal(key, self.mean.shape)
+        return self.from_noise(jax.random.normal(key, self.mean.shape))
+
+    def from_noise(self, noise: Array) -> Array:
+        """The sample that `policy_noise` [..., A] makes."""
+        return self.mean + self.std * noise
 
     def mode(self) -> Array:
         """The mean [..., A]."""
@@ -119,7 +124,11 @@ class Categorical:
 
     def sample(self, key: Array) -> Array:
         """One-hot sample [..., A] with the straight-through gradient of the probabilities."""
-        return sample_onehot(jax.random.uniform(key, self.logits.shape[:-1]), self.logits)
+        return self.from_noise(jax.random.uniform(key, self.logits.shape[:-1]))
+
+    def from_noise(self, noise: Array) -> Array:
+        """The sample that `policy_noise` [...] makes."""
+        return sample_onehot(noise, self.logits)
 
     def mode(self) -> Array:
         """One-hot of the likeliest action [..., A]."""
@@ -141,6 +150,13 @@ def policy(config: HeadsConfig, action: ActionSpec, outputs: Array) -> BoundedNo
         return Categorical(unimix_logits(outputs, config.unimix))
     mean, std = jnp.split(outputs, 2, axis=-1)
     return BoundedNormal(jnp.tanh(mean), config.min_std + (config.max_std - config.min_std) * jax.nn.sigmoid(std + 2.0))
+
+
+def policy_noise(action: ActionSpec, key: Array, shape: tuple[int, ...]) -> Array:
+    """What samples of policies of this shape are made of: normal [*shape, A], or uniform [*shape] where discrete."""
+    if isinstance(action, DiscreteAction):
+        return jax.random.uniform(key, shape)
+    return jax.random.normal(key, (*shape, action.size))
 
 
 def model_action(action: ActionSpec, raw: Array, clip: bool = True) -> Array:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
-from ne_dreamer_jax.nets.blocks import Linear
+from ne_dreamer_jax.nets.blocks import Linear, kernel_init
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, Width
 from ne_dreamer_jax.types import Array
@@ -30,6 +30,12 @@ class PredictorConfig:
     projector: bool = True
     """A bias-free linear layer F to E before the tokens' own linear layer. Without it the function class is the
     same; what changes is the optimisation (the paper's w/o projector)."""
+    discrete_action: Literal["embedding", "normalised"] = "embedding"
+    """How a discrete action becomes a token: an embedding, or its one-hot through linear, LayerNorm and GELU, as a
+    continuous action (the released code, which never reaches its own embedding)."""
+    attention_init: Literal["fan_in", "xavier"] = "fan_in"
+    """How queries, keys and values start: as every other layer (standard deviation 0.0625 at width 256), or uniform, by
+    Xavier's rule for one layer that gives all three (0.0442; the released code)."""
 
     def __post_init__(self) -> None:
         ranges.check(self)
@@ -82,7 +88,9 @@ class TransformerLayer(nn.Module):
     @nn.compact
     def __call__(self, x: Array, mask: Array) -> Array:
         c = self.config
-        qkv = Linear(3 * c.width, dtype=self.dtype, name="qkv")(LayerNorm(self.dtype, name="attention_norm")(x))
+        start = initializers.xavier_uniform() if c.attention_init == "xavier" else kernel_init()
+        normed = LayerNorm(self.dtype, name="attention_norm")(x)
+        qkv = Linear(3 * c.width, kernel_init=start, dtype=self.dtype, name="qkv")(normed)
         query, key, value = jnp.split(qkv.reshape(*x.shape[:-1], 3 * c.heads, c.width // c.heads), 3, axis=-2)
         # In float32 throughout: at 2T tokens it costs next to nothing beside the linear layers.
         query, key, value = (part.astype(jnp.float32) for part in (query, key, value))
@@ -101,6 +109,7 @@ class Predictor(nn.Module):
     across_episodes: bool = False
     dtype: Any = jnp.float32
     steps: int = 1  # K, how many embeddings are predicted at each step
+    at_state: bool = False  # read at the state's token, which does not see the action of its own step
 
     @nn.compact
     def __call__(self, feature: Array, action: Array, is_first: Array) -> Array:
@@ -113,12 +122,13 @@ class Predictor(nn.Module):
         if c.projector:
             state = Linear(self.embedding, use_bias=False, dtype=dtype, name="projector")(state)
         state = Linear(c.width, dtype=dtype, name="state_in")(state)
-        if self.discrete:
+        if self.discrete and c.discrete_action == "embedding":
             act = Linear(c.width, use_bias=False, dtype=dtype, name="action_in")(action)
         else:
             act = Linear(c.width, dtype=dtype, name="action_in")(action)
             act = nn.gelu(LayerNorm(dtype, name="action_norm")(act), approximate=False)
-        x = state + act if c.layers == 0 else self._attend(state, act, is_first)
+        alone = state if self.at_state else state + act
+        x = self._attend(state, act, is_first) if c.layers else alone
         x = Linear(c.width, dtype=dtype, name="hidden")(LayerNorm(dtype, name="out_norm")(x))
         x = Linear(self.steps * self.embedding, dtype=dtype, name="out")(nn.gelu(x, approximate=False))
         return x.astype(jnp.float32)
@@ -133,4 +143,4 @@ class Predictor(nn.Module):
         mask = episode_causal_mask(is_first, across_episodes=self.across_episodes)
         for i in range(c.layers):
             x = TransformerLayer(c, self.dtype, name=f"layer{i}")(x, mask)
-        return x[:, 1::2]
+        return x[:, 0::2] if self.at_state else x[:, 1::2]

@@ -20,6 +20,10 @@ from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, Share, Width
 from ne_dreamer_jax.types import Array, Latent
 
+PARTS_OF_ONE_TENSOR = {"state_kernel": "hidden_kernel", "input_kernel": "hidden_kernel"}
+"""Parameter of `RSSM` -> the tensor that it is part of in DreamerV3 and the released code, whose block-linear layers
+have one kernel each: gradients are clipped by the norm of the whole."""
+
 
 @dataclass(frozen=True)
 class RSSMConfig:
@@ -187,12 +191,12 @@ class RSSM(nn.Module):
 
 
 def observe(
-    rssm: RSSM, params: Any, key: Array, context: Latent, embedding: Array, prev_action: Array, is_first: Array
+    rssm: RSSM, params: Any, uniform: Array, context: Latent, embedding: Array, prev_action: Array, is_first: Array
 ) -> tuple[Latent, Array]:
     """Posterior latents [B, T, ...] and logits [B, T, S, K] along sequences.
 
     ``context`` [B, ...] is the latent before the first step, ``embedding`` [B, T, E], ``prev_action`` [B, T, A],
-    ``is_first`` [B, T]. The key draws the latents.
+    ``is_first`` [B, T]. The latents are drawn by ``uniform`` [B, T, S], numbers in [0, 1).
     """
 
     def call(method: Any, *args: Any) -> Any:
@@ -201,7 +205,6 @@ def observe(
     time_major = lambda x: jnp.swapaxes(x, 0, 1)
     observation_in = call(RSSM.embed_observation, embedding)
     action_in = call(RSSM.embed_action, mask_first(prev_action, is_first))
-    uniform = jax.random.uniform(key, (*is_first.shape, rssm.config.stoch))
 
     def step(latent: Latent, inputs: tuple[Array, ...]) -> tuple[Latent, tuple[Latent, Array]]:
         latent, logits = call(RSSM.observe_step, latent, *inputs)

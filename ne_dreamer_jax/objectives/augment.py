@@ -29,7 +29,14 @@ def shift_images(images: Array, shift: Array) -> Array:
     return jnp.einsum("bij,bthjc->bthic", weights(shift[:, 1], width), rows, precision=exact)
 
 
-def random_shift(key: Array, images: Array, largest: float) -> Array:
-    """`shift_images` by up to ``largest`` pixels, uniform in each direction; the key is consumed."""
-    shift = jax.random.uniform(key, (images.shape[0], 2), minval=-largest, maxval=largest)
+def random_shift(key: Array, images: Array, largest: float, whole: bool = False) -> Array:
+    """`shift_images` by up to ``largest`` pixels, uniform in each direction; the key is consumed.
+
+    With ``whole`` every whole number of pixels from -largest to largest, largest rounded down, is as likely.
+    """
+    shape = (images.shape[0], 2)
+    if whole:
+        shift = jax.random.randint(key, shape, -int(largest), int(largest) + 1).astype(jnp.float32)
+    else:
+        shift = jax.random.uniform(key, shape, minval=-largest, maxval=largest)
     return shift_images(images, shift)

@@ -20,6 +20,8 @@ class Model(NamedTuple):
     unroll: Callable[[Params, Array, Batch], Rollout]
     """(params, key, batch) -> encodes a batch and unrolls the posterior along it; images may be float32, as the
     encoder's stages take them. For objectives that look at other views of the observations."""
+    microbatches: int = 1
+    """Parts in which sequences go through an objective's own networks, see `nets.microbatches`."""
 
 
 class Objective(NamedTuple):

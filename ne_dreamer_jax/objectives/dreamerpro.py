@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import assignment_loss, sinkhorn
 from ne_dreamer_jax.nets.blocks import Linear
+from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.objectives.augment import random_shift
 from ne_dreamer_jax.objectives.base import Model, Objective
 from ne_dreamer_jax.settings import ranges
@@ -51,6 +53,11 @@ class DreamerPro:
     """Updates at the start in which the prototypes stay as they are."""
     max_shift: Annotated[float, Range(0.0, 1e6)] = 3.0
     """Pixels by which a view may be shifted in each direction; the same across time."""
+    whole_shifts: bool = False
+    """Whether views are shifted by whole pixels only (the released code) or by any distance (DreamerPro)."""
+    projection_init: Literal["fan_in", "uniform"] = "fan_in"
+    """How both projections start: as every other layer, biases at zero; or weights and biases uniform within
+    1/sqrt(fan in) (the released code, which leaves them as PyTorch makes them): 1.73 times smaller."""
     warm_up: CountOrNone = 1
     """Steps at the start of a sequence that count for neither ``swav`` nor ``temporal``."""
 
@@ -80,12 +87,13 @@ class DreamerPro:
                 f"{self.warm_up}."
             )
         linear = Linear(self.dimension, dtype=nets.dtype)
+        shift = functools.partial(random_shift, largest=self.max_shift, whole=self.whole_shifts)
 
         def init(key: Array) -> Params:
             of_embedding, of_feature, of_prototypes = jax.random.split(key, 3)
             return {
-                "embedding": linear.init(of_embedding, jnp.zeros((1, nets.embedding)))["params"],
-                "feature": linear.init(of_feature, jnp.zeros((1, nets.feature)))["params"],
+                "embedding": self._projection(of_embedding, nets.embedding),
+                "feature": self._projection(of_feature, nets.feature),
                 "prototypes": _unit(jax.random.normal(of_prototypes, (self.prototypes, self.dimension)))[0],
             }
 
@@ -100,7 +108,7 @@ class DreamerPro:
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
             shift_key, unroll_key = jax.random.split(key)
             batch = _two_views(rollout.batch)
-            shifted = {name: random_shift(shift_key, _centred(batch.obs[name]), self.max_shift) for name in images}
+            shifted = {name: shift(shift_key, _centred(batch.obs[name])) for name in images}
             batch = batch._replace(obs={**batch.obs, **shifted})
             views = model.unroll(params, unroll_key, batch)
 
@@ -115,7 +123,8 @@ class DreamerPro:
                 unit = unit[:, self.warm_up :].reshape(2, -1, self.dimension)
                 return jnp.matmul(unit, prototypes.T, precision=jax.lax.Precision.HIGHEST), length
 
-            teacher = nets.apply("encoder", target, batch.obs)
+            teach = lambda obs: nets.apply("encoder", target, obs)
+            teacher = in_microbatches(teach, model.microbatches)(batch.obs)
             given, _ = scores(target["projection"], jax.lax.stop_gradient(teacher))
             assignment = jax.vmap(lambda view: sinkhorn(view, self.epsilon, self.iterations))(given)
             of_embedding, embedding_length = scores(own["embedding"], views.embedding)
@@ -131,6 +140,19 @@ class DreamerPro:
             return losses, {"prototypes/used_entropy": jax.lax.stop_gradient(entropy)}
 
         return Objective(init, init_target, loss, after_update)
+
+    def _projection(self, key: Array, inputs: int) -> Params:
+        """Fresh parameters of a linear map ``[..., inputs]`` to ``[..., dimension]``."""
+        linear = Linear(self.dimension)
+        if self.projection_init == "uniform":
+            uniform = _uniform_within(inputs**-0.5)
+            linear = Linear(self.dimension, kernel_init=uniform, bias_init=uniform)
+        return linear.init(key, jnp.zeros((1, inputs)))["params"]
+
+
+def _uniform_within(bound: float) -> Callable[..., Array]:
+    """An initialiser between ``-bound`` and ``bound``."""
+    return lambda key, shape, dtype: jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def _taught(params: Params) -> Params:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import cosine_alignment, next_embedding_loss, vicreg
+from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.predictor import Predictor, PredictorConfig, check_length
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
 from ne_dreamer_jax.settings import ranges
@@ -35,12 +36,17 @@ class NextEmbedding:
     """How predictions are aligned to embeddings: as in the paper, or by a loss that it names as open."""
     redundancy: NonNegative = 5e-4
     """Weight of the off-diagonal terms of Barlow Twins."""
+    sample_deviation: bool = False
+    """Whether Barlow Twins standardises by the sample's deviation (N - 1; the released code) or the population's."""
     action: Literal["current", "previous"] = "current"
     """Whether the predictor at t is fed a_t (the paper) or a_{t-1} (the released code)."""
     masked: bool = True
     """Whether pairs across two episodes are left out of the loss (the paper) or not (the released code)."""
     across_episodes: bool = False
     """Whether attention reaches back beyond the start of the episode (the released code)."""
+    unshifted_token: Literal["action", "state"] = "action"
+    """Which token of step t predicts the embedding of that same step, where ``shift`` is 0: the action's, as for all
+    later ones, or the state's, which does not see a_t (the released code)."""
 
     def __post_init__(self) -> None:
         ranges.check(self)
@@ -73,7 +79,10 @@ class NextEmbedding:
         check_length(self.predictor, model.length)
         nets, space = model.nets, model.nets.spec.action
         discrete = isinstance(space, DiscreteAction)
-        predictor = Predictor(self.predictor, nets.embedding, discrete, self.across_episodes, nets.dtype, self.steps)
+        at_state = self.shift == 0 and self.unshifted_token == "state"
+        predictor = Predictor(
+            self.predictor, nets.embedding, discrete, self.across_episodes, nets.dtype, self.steps, at_state
+        )
         weights = [self.step_discount**k for k in range(self.steps)]
         align: Any = ALIGNMENTS[self.alignment]
 
@@ -84,12 +93,20 @@ class NextEmbedding:
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
             action = rollout.action if self.action == "current" else rollout.prev_action
             is_first = rollout.batch.is_first
-            predicted: Any = predictor.apply({"params": params["objective"]}, rollout.feature, action, is_first)
+            predict = lambda *inputs: predictor.apply({"params": params["objective"]}, *inputs)
+            predicted: Any = in_microbatches(predict, model.microbatches)(rollout.feature, action, is_first)
             total = jnp.zeros(())
             metrics: Metrics = {}
             for k, (weight, ahead) in enumerate(zip(weights, jnp.split(predicted, self.steps, axis=-1), strict=True)):
                 value, details = next_embedding_loss(
-                    ahead, rollout.embedding, is_first, self.redundancy, self.shift + k, self.masked, align
+                    ahead,
+                    rollout.embedding,
+                    is_first,
+                    self.redundancy,
+                    self.shift + k,
+                    self.masked,
+                    align,
+                    self.sample_deviation,
                 )
                 total = total + weight / sum(weights) * value
                 prefix = f"next_embedding/{k + 1}_" if k else "next_embedding/"

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import image_loss, vector_loss
 from ne_dreamer_jax.nets.decoder import Decoder
+from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.rssm import initial_latent
 from ne_dreamer_jax.objectives.base import Model, Objective, keep_target, no_target
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Width
-from ne_dreamer_jax.types import Array, Metrics, Params, Rollout
+from ne_dreamer_jax.types import Array, Latent, Metrics, Params, Rollout
 
 
 @dataclass(frozen=True)
@@ -47,18 +48,21 @@ class Reconstruction:
             return decoder.init(key, initial_latent(nets.rssm.config, (1,)))["params"]
 
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
-            decoded: Any = decoder.apply({"params": params["objective"]}, rollout.latent)
-            errors = {}
-            for name, predicted in decoded.items():
-                observed = rollout.batch.obs[name]
-                of_image = observed.dtype == jnp.uint8
-                each = (
-                    image_loss(predicted, observed)
-                    if of_image
-                    else vector_loss(predicted, observed.reshape(predicted.shape))
-                )
-                errors[name] = jnp.mean(each)
+            def decode(latent: Latent, obs: Mapping[str, Array]) -> dict[str, Array]:
+                """The errors of each observation, [b, T]."""
+                decoded: Any = decoder.apply({"params": params["objective"]}, latent)
+                return {name: _error(predicted, obs[name]) for name, predicted in decoded.items()}
+
+            of_each = in_microbatches(decode, model.microbatches)(rollout.latent, rollout.batch.obs)
+            errors = {name: jnp.mean(error) for name, error in of_each.items()}
             total = sum(errors.values(), jnp.zeros(()))
             return {"reconstruction": total}, {f"reconstruction/{name}": x for name, x in errors.items()}
 
         return Objective(init, no_target, loss, keep_target)
+
+
+def _error(predicted: Array, observed: Array) -> Array:
+    """Of a decoded image or vector, by step."""
+    if observed.dtype == jnp.uint8:
+        return image_loss(predicted, observed)
+    return vector_loss(predicted, observed.reshape(predicted.shape))

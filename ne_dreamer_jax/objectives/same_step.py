@@ -30,6 +30,8 @@ class SameStep:
 
     redundancy: NonNegative = 5e-4
     """Weight of the off-diagonal terms of Barlow Twins."""
+    sample_deviation: bool = False
+    """Whether Barlow Twins standardises by the sample's deviation (N - 1; the released code) or the population's."""
 
     def __post_init__(self) -> None:
         ranges.check(self)
@@ -49,7 +51,9 @@ class SameStep:
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
             projected: Any = projector.apply({"params": params["objective"]["projector"]}, rollout.feature)
             embedding = jax.lax.stop_gradient(rollout.embedding)
-            value, metrics = barlow_twins(projected.astype(jnp.float32), embedding, None, self.redundancy)
+            value, metrics = barlow_twins(
+                projected.astype(jnp.float32), embedding, None, self.redundancy, sample_deviation=self.sample_deviation
+            )
             return {"same_step": value}, {f"same_step/{name}": x for name, x in metrics.items()}
 
         return Objective(init, no_target, loss, keep_target)

@@ -7,6 +7,7 @@ checkpoints were written.
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections.abc import Callable
@@ -161,6 +162,7 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
                 record.write(counters, values)
                 if is_main_process:
                     draw(run, files, record, echo)
+                gc.collect()  # cycles that wait for their turn lie scattered, and keep whole pages: 10 kB a chunk
                 if step < schedule.total:  # at the end everything is saved below
                     saves.if_best(state, counters, record.score(counters))
             (stopped_by,) = parallel.agreed(stop.signal or 0)

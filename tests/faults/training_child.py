@@ -7,6 +7,7 @@ thread; AGAIN seconds after that once more. It says when.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 import time
@@ -22,6 +23,7 @@ from tests.experiments import toy
 def main(logdir: str, moment: str = "never", number: str = "15", again: str = "") -> int:
     """Trains; returns the exit code."""
     jax.config.update("jax_disable_most_optimizations", True)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background ignores
     run = training.build(toy.config(env_steps=160, eval_every=None), toy.env())
     sent: list[float] = []
 

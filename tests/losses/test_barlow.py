@@ -187,3 +187,25 @@ def test_wrong_shapes_are_refused(shapes, options, message):
 def test_wrong_mask_is_refused():
     with pytest.raises(ValueError, match="mask of shape"):
         barlow_twins(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.ones((4, 1), bool))
+
+
+def test_the_samples_deviation_is_what_the_released_code_divides_by():
+    """Bessel's N - 1 in the deviations, N in the correlation: equal sets correlate by 1 - 1/N."""
+    rng = np.random.default_rng(8)
+    p, q = rng.normal(size=(2, 6, 3))
+    by_sample = lambda x: (x - x.mean(0)) / (x.std(0, ddof=1) + 1e-8)
+    correlation = by_sample(p).T @ by_sample(q) / 6
+    off = ~np.eye(3, dtype=bool)
+    want = ((1 - np.diag(correlation)) ** 2).sum() + 0.1 * (correlation[off] ** 2).sum()
+    p, q = (jnp.asarray(x, jnp.float32) for x in (p, q))
+    loss, _ = barlow_twins(p, q, redundancy=0.1, sample_deviation=True)
+    np.testing.assert_allclose(loss, want, rtol=1e-5)
+    _, metrics = barlow_twins(p, p, sample_deviation=True)
+    np.testing.assert_allclose(metrics["diagonal"], 1 - 1 / 6, rtol=1e-5)
+
+
+def test_a_constant_dimension_has_no_gradient_by_the_samples_deviation_either():
+    p = jnp.asarray(np.random.default_rng(9).normal(size=(5, 3)), jnp.float32).at[:, 1].set(2.0)
+    loss, grad = jax.value_and_grad(lambda x: barlow_twins(x, p + 1.0, sample_deviation=True)[0])(p)
+    assert np.isfinite(loss)
+    assert np.isfinite(grad).all()

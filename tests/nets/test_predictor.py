@@ -159,3 +159,36 @@ def test_bfloat16_is_of_the_products_alone():
     params = jax.eval_shape(predictor.init, jax.random.key(0), FEATURE, ACTION, IS_FIRST)
     out = jax.eval_shape(predictor.apply, params, FEATURE, ACTION, IS_FIRST)
     assert {x.dtype for x in jax.tree.leaves((params, out))} == {jnp.dtype(jnp.float32)}
+
+
+@pytest.mark.parametrize("layers", [0, 2])
+def test_a_prediction_at_the_states_token_does_not_see_the_action_of_its_step(layers):
+    predictor = Predictor(replace(CONFIG, layers=layers), E, discrete=False, at_state=True)
+    params = tiny.fill(jax.eval_shape(predictor.init, jax.random.key(0), FEATURE, ACTION, IS_FIRST))
+    base = predictor.apply(params, FEATURE, ACTION, IS_FIRST)
+    for s in range(T):
+        action = ACTION.copy()
+        action[:, s] += 1.0
+        changed = np.any(np.asarray(predictor.apply(params, FEATURE, action, IS_FIRST) != base), axis=-1)
+        later = np.arange(T)[None] > s
+        want = later & (EPISODE[:, s, None] == EPISODE) if layers else np.zeros((B, T), bool)
+        np.testing.assert_array_equal(changed, want)
+
+
+def test_a_normalised_discrete_action_is_read_as_a_continuous_one():
+    (as_discrete, predict), (as_continuous, same) = (
+        make(discrete, discrete_action="normalised") for discrete in (True, False)
+    )
+    assert jax.tree.structure(as_discrete) == jax.tree.structure(as_continuous)
+    onehot = np.eye(A, dtype=np.float32)[RNG.integers(0, A, (B, T))]
+    np.testing.assert_array_equal(
+        predict(as_discrete, FEATURE, onehot, IS_FIRST), same(as_continuous, FEATURE, onehot, IS_FIRST)
+    )
+
+
+@pytest.mark.parametrize(("init", "deviation"), [("fan_in", 1 / 16), ("xavier", (2 / (256 + 768)) ** 0.5)])
+def test_queries_keys_and_values_start_as_asked(init, deviation):
+    predictor = Predictor(PredictorConfig(layers=1, positions=6, attention_init=init), E, discrete=False)
+    params = predictor.init(jax.random.key(0), FEATURE, ACTION, IS_FIRST)["params"]
+    assert np.std(params["layer0"]["qkv"]["kernel"]) == pytest.approx(deviation, rel=0.02)
+    assert np.std(params["layer0"]["out"]["kernel"]) == pytest.approx(1 / 16, rel=0.02)

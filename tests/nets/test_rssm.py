@@ -22,6 +22,7 @@ EMBEDDING = RNG.normal(size=(B, T, E)).astype(np.float32)
 PREV_ACTION = RNG.uniform(-1, 1, (B, T, A)).astype(np.float32)
 IS_FIRST = np.zeros((B, T), bool)
 IS_FIRST[0, 0] = IS_FIRST[1, 3] = True
+UNIFORM = RNG.uniform(size=(B, T, CONFIG.stoch)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def model():
 
     @jax.jit
     def run(context, embedding, prev_action, is_first):
-        return observe(rssm, params, jax.random.key(1), context, embedding, prev_action, is_first)
+        return observe(rssm, params, UNIFORM, context, embedding, prev_action, is_first)
 
     return SimpleNamespace(rssm=rssm, params=params, run=run)
 
@@ -109,10 +110,9 @@ def test_observing_a_sequence_is_observing_step_by_step(model):
         return module.observe_step(latent, *inputs, is_first, uniform)
 
     apply = jax.jit(lambda *args: model.rssm.apply({"params": model.params}, *args, method=step))
-    uniform = jax.random.uniform(jax.random.key(1), (B, T, CONFIG.stoch))
     latent = tiny.latent((B,), 2)
     for t in range(T):
-        latent, step_logits = apply(latent, EMBEDDING[:, t], PREV_ACTION[:, t], IS_FIRST[:, t], uniform[:, t])
+        latent, step_logits = apply(latent, EMBEDDING[:, t], PREV_ACTION[:, t], IS_FIRST[:, t], UNIFORM[:, t])
         np.testing.assert_allclose(latent.deter, latents.deter[:, t], atol=1e-5)
         np.testing.assert_array_equal(latent.stoch, latents.stoch[:, t])
         np.testing.assert_allclose(step_logits, logits[:, t], atol=1e-4)
@@ -228,7 +228,7 @@ def test_bfloat16_products_keep_float32_latents():
     shapes = jax.eval_shape(
         rssm.init, jax.random.key(0), initial_latent(CONFIG, (1,)), jnp.zeros((1, E)), jnp.zeros((1, A))
     )
-    run = lambda p: observe(rssm, p, jax.random.key(1), tiny.latent((B,)), EMBEDDING, PREV_ACTION, IS_FIRST)
+    run = lambda p: observe(rssm, p, UNIFORM, tiny.latent((B,)), EMBEDDING, PREV_ACTION, IS_FIRST)
     out = jax.eval_shape(run, shapes["params"])
     assert {x.dtype for x in jax.tree.leaves((shapes, out))} == {jnp.dtype(jnp.float32)}
     assert isinstance(out[0], Latent)

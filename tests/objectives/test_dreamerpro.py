@@ -178,3 +178,21 @@ def test_the_teacher_starts_as_a_copy_and_follows_at_its_rate(made):
 def test_what_does_not_fit_is_refused(changes, spec, message):
     with pytest.raises(ValueError, match=message):
         replace(CONFIG, **changes).build(Model(SimpleNamespace(**{**vars(NETS), "spec": spec}), T, unroll))
+
+
+def test_whole_shifts_only_move_pixels():
+    picture = images(shape=(300, 1, 5, 5, 1))
+    got = random_shift(KEY, picture, 1.0, whole=True)
+    inner = np.asarray(got)[:, 0, 2, 2, 0]
+    sources = np.asarray(picture)[:, 0, 1:4, 1:4, 0].reshape(300, 9)
+    assert (np.abs(sources - inner[:, None]).min(axis=1) < 1e-6).all()
+    moves = np.bincount(np.abs(sources - inner[:, None]).argmin(axis=1), minlength=9)
+    assert (moves > 15).all()  # 33 of each are expected
+
+
+def test_projections_start_within_the_root_of_their_inputs():
+    own = replace(CONFIG, dimension=200, projection_init="uniform").build(Model(NETS, T, unroll)).init(KEY)
+    for name, inputs in (("embedding", E), ("feature", F)):
+        for values in own[name].values():
+            assert 0.9 < np.abs(values).max() * inputs**0.5 <= 1
+            assert np.abs(np.mean(values)) < 0.1

@@ -25,7 +25,7 @@ from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.settings import names, ranges
-from ne_dreamer_jax.settings.ranges import NonNegative, Range
+from ne_dreamer_jax.settings.ranges import Count, NonNegative, Range
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import (
     Array,
@@ -78,11 +78,21 @@ class AgentConfig:
     """B, sequences in a batch."""
     batch_length: Annotated[int, Range(1, 1_000_000)] = 64
     """T, steps in a sequence."""
+    microbatches: Count = 1
+    """Parts in which an update's sequences, and the trajectories imagined from them, go through the networks one after
+    the other. The update is the same, its losses are taken over the whole batch; of what the gradient needs there is
+    one part in memory at a time, for one more forward pass. Divides ``batch_size``."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32."""
 
     def __post_init__(self) -> None:
         ranges.check(self)
+        if self.batch_size % self.microbatches:
+            divisors = [str(n) for n in range(1, self.batch_size + 1) if self.batch_size % n == 0]
+            raise ValueError(
+                f"agent.microbatches: expected a divisor of agent.batch_size {self.batch_size} "
+                f"({', '.join(divisors)}), got {self.microbatches}."
+            )
 
     @property
     def method(self) -> str:
@@ -104,7 +114,7 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
     """
     dtype = _compute_dtype(config.compute_dtype)
     nets = Networks.build(spec, config.encoder, config.rssm, config.heads, dtype)
-    objective = config.objective.build(world_model_of(nets, config.batch_length))
+    objective = config.objective.build(world_model_of(nets, config.batch_length, config.microbatches))
     optimizer = optim.make(config.optimizer)
     _check_loss_scales(config)
 
@@ -142,13 +152,20 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
 
     def losses(params: Params, state: TrainState, key: Array, batch: Batch) -> tuple[Array, tuple]:
         observe_key, objective_key, imagine_key = jax.random.split(key, 3)
-        rollout, posterior = world_model.posterior_rollout(nets, params, observe_key, batch)
+        rollout, posterior = world_model.posterior_rollout(nets, params, observe_key, batch, config.microbatches)
         model, model_metrics = world_model.prediction_losses(
             nets, config.world_model, params, rollout, posterior, behavior.head_discount(config.behavior)
         )
         representation, objective_metrics = objective.loss(params, state.target, objective_key, rollout)
         actor_critic, scale, behavior_metrics = behavior.actor_critic_losses(
-            nets, config.behavior, params, state.slow_critic, state.return_scale, imagine_key, rollout
+            nets,
+            config.behavior,
+            params,
+            state.slow_critic,
+            state.return_scale,
+            imagine_key,
+            rollout,
+            config.microbatches,
         )
         named = {**model, **representation, **actor_critic}
         total = sum((config.loss_scales[name] * value for name, value in named.items()), jnp.zeros(()))
@@ -210,7 +227,8 @@ def inspection(config: AgentConfig, nets: Networks) -> Inspection:
         )
 
     def imagine(params: Params, key: Array, latent: Latent, horizon: int) -> Imagined:
-        trajectory = behavior.imagine(nets, params, key, latent, horizon)
+        noise = behavior.imagination_noise(nets, key, latent.deter.shape[0], horizon)
+        trajectory = behavior.imagine(nets, params, noise, latent)
         features = jnp.concatenate([trajectory.seen, trajectory.last[None]])
         action = decode_action(nets.spec.action, trajectory.action, config.heads.clip_actions)
         return Imagined(features, action, heads(params, features))
@@ -222,10 +240,10 @@ def inspection(config: AgentConfig, nets: Networks) -> Inspection:
     )
 
 
-def world_model_of(nets: Networks, length: int) -> Model:
+def world_model_of(nets: Networks, length: int, microbatches: int = 1) -> Model:
     """What objectives are built for: networks, and sequences of ``length`` steps."""
-    unroll = lambda params, key, batch: world_model.posterior_rollout(nets, params, key, batch)[0]
-    return Model(nets, length, unroll)
+    unroll = lambda params, key, batch: world_model.posterior_rollout(nets, params, key, batch, microbatches)[0]
+    return Model(nets, length, unroll, microbatches)
 
 
 def parameter_counts(params: Params) -> dict[str, int]:
@@ -234,8 +252,8 @@ def parameter_counts(params: Params) -> dict[str, int]:
 
 
 def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
-    """The gradients; as much as some arrays of all imagined features; the encoder's, by frames."""
-    steps = config.batch_size * config.batch_length
+    """The gradients; as much as some arrays of all imagined features of a microbatch; the encoder's, by frames."""
+    steps = config.batch_size * config.batch_length // config.microbatches
     imagined = 4 * feature * steps * (config.behavior.horizon + 1)
     arrays = REINFORCE_ARRAYS if config.behavior.gradient == "reinforce" else DYNAMICS_ARRAYS
     return 4 * sum(parameter_counts(params).values()) + int(arrays * imagined) + FRAME_BYTES * steps

@@ -23,7 +23,8 @@ from ne_dreamer_jax.losses import (
     twohot_mean,
     update_percentiles,
 )
-from ne_dreamer_jax.nets.heads import model_action, policy
+from ne_dreamer_jax.nets.heads import model_action, policy, policy_noise
+from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSM, feature
 from ne_dreamer_jax.settings import ranges
@@ -61,6 +62,8 @@ class BehaviorConfig:
     """Decay of the moving percentiles of the returns."""
     return_percentiles: tuple[Percentile, Percentile] = (5.0, 95.0)
     """The returns are normalised by the range between these."""
+    percentile_method: Literal["linear", "nearest"] = "linear"
+    """What a percentile that lies between two returns is: interpolated, or the nearer one (the released code)."""
     return_floor: Positive = 1.0
     """Returns are never divided by less."""
 
@@ -80,16 +83,34 @@ class Trajectory(NamedTuple):
     action: Array  # float32 [H, M, A], raw samples: not clipped
 
 
+class Noise(NamedTuple):
+    """The random numbers of M imagined trajectories."""
+
+    action: Array  # [H, M, ...], see `policy_noise`
+    latent: Array  # [H, M, S], uniform
+
+
+def imagination_noise(nets: Networks, key: Array, rows: int, horizon: int) -> Noise:
+    """Draws `Noise` for M = ``rows`` trajectories of H = ``horizon`` steps; the key is consumed."""
+
+    def of_step(key: Array) -> Noise:
+        action_key, latent_key = jax.random.split(key)
+        uniform = jax.random.uniform(latent_key, (rows, nets.rssm.config.stoch))
+        return Noise(policy_noise(nets.spec.action, action_key, (rows,)), uniform)
+
+    return jax.vmap(of_step)(jax.random.split(key, horizon))
+
+
 def imagine(
     nets: Networks,
     params: Params,
-    key: Array,
+    noise: Noise,
     start: Latent,
-    horizon: int,
     look: Callable[[Array], Any] = lambda state: state,
     through_model: bool = False,
 ) -> Trajectory:
-    """H steps of the prior under the policy from ``start`` [M, ...]; the models see clipped actions.
+    """H steps of the prior under the policy from ``start`` [M, ...], H being that of the noise; the models see clipped
+    actions.
 
     ``look`` is applied to each state's feature [M, F] while it is at hand: what heads make of it is small, and all
     features of all states are not.
@@ -98,18 +119,16 @@ def imagine(
     ``through_model``; otherwise actions are constants, and the actor need not be run again for its loss.
     """
 
-    def step(latent: Latent, key: Array) -> tuple[Latent, tuple[Any, Array, Array]]:
-        action_key, latent_key = jax.random.split(key)
+    def step(latent: Latent, noise: Noise) -> tuple[Latent, tuple[Any, Array, Array]]:
         state = feature(latent)
         outputs = keep_products(nets.apply)("actor", params, state)
-        raw = policy(nets.heads, nets.spec.action, outputs).sample(action_key)
+        raw = policy(nets.heads, nets.spec.action, outputs).from_noise(noise.action)
         raw = raw if through_model else jax.lax.stop_gradient(raw)
-        uniform = jax.random.uniform(latent_key, (state.shape[0], nets.rssm.config.stoch))
         action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
-        after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, uniform, method=RSSM.imagine_step)
+        after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, action, noise.latent, method=RSSM.imagine_step)
         return after, (look(state), outputs, raw)
 
-    last, (seen, outputs, actions) = jax.lax.scan(step, start, jax.random.split(key, horizon))
+    last, (seen, outputs, actions) = jax.lax.scan(step, start, noise)
     return Trajectory(seen, look(feature(last)), outputs, actions)
 
 
@@ -160,11 +179,13 @@ def actor_critic_losses(
     scale: ReturnScale,
     key: Array,
     rollout: Rollout,
+    microbatches: int = 1,
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
-    ``rollout.feature`` (DreamerV3).
+    ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
+    their returns are those of all.
     """
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
@@ -187,7 +208,9 @@ def actor_critic_losses(
 
     acting = {**frozen, "actor": params["actor"]}
     start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
-    imagined = imagine(nets, acting, key, start, config.horizon, judge, through_model)
+    noise = imagination_noise(nets, key, start.deter.shape[0], config.horizon)
+    dream = lambda start, noise: imagine(nets, acting, noise, start, judge, through_model)
+    imagined = in_microbatches(dream, microbatches, (0, 1), Trajectory(1, 0, 1, 1))(start, noise)  # type: ignore[arg-type]
     seen, last = imagined.seen, imagined.last
     of_all = lambda before, last: jnp.concatenate([before, last[None]]).T  # [M, H + 1]
     reward, discount, value = (
@@ -199,7 +222,9 @@ def actor_critic_losses(
     weight = jax.lax.stop_gradient(jnp.cumprod(discount, axis=1))[:, :-1]
 
     scale = ReturnScale(
-        *update_percentiles(scale.low, scale.high, returns, config.return_decay, config.return_percentiles)
+        *update_percentiles(
+            scale.low, scale.high, returns, config.return_decay, config.return_percentiles, config.percentile_method
+        )
     )
     divisor = return_scale(scale.low, scale.high, config.return_floor)
     # The entropy's gradient goes to the actor at its own state, never through the states before.

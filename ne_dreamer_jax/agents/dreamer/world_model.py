@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from ne_dreamer_jax.losses import balanced_kl, symexp_bins, twohot_loss
 from ne_dreamer_jax.nets.heads import encode_action
+from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSM, feature, mask_first, observe
 from ne_dreamer_jax.settings import ranges
@@ -36,13 +37,24 @@ class WorldModelConfig:
         ranges.check(self)
 
 
-def posterior_rollout(nets: Networks, params: Params, key: Array, batch: Batch) -> tuple[Rollout, Array]:
-    """Encodes a batch and unrolls the posterior along it: the rollout, and the posterior's logits [B, T, S, K]."""
+def posterior_rollout(
+    nets: Networks, params: Params, key: Array, batch: Batch, microbatches: int = 1
+) -> tuple[Rollout, Array]:
+    """Encodes a batch and unrolls the posterior along it: the rollout, and the posterior's logits [B, T, S, K].
+
+    The sequences may go through the networks in several ``microbatches``; the result is the same.
+    """
     encode = lambda action: encode_action(nets.spec.action, action, nets.heads.clip_actions)
     action, prev_action = encode(batch.action), encode(batch.prev_action)
     prev_action = mask_first(prev_action, batch.is_first)
-    embedding = nets.apply("encoder", params, batch.obs)
-    latent, logits = observe(nets.rssm, params["rssm"], key, batch.context, embedding, prev_action, batch.is_first)
+    uniform = jax.random.uniform(key, (*batch.is_first.shape, nets.rssm.config.stoch))
+
+    def unroll(obs: Any, uniform: Array, context: Latent, prev_action: Array, is_first: Array) -> Any:
+        embedding = nets.apply("encoder", params, obs)
+        return embedding, *observe(nets.rssm, params["rssm"], uniform, context, embedding, prev_action, is_first)
+
+    in_parts = in_microbatches(unroll, microbatches)
+    embedding, latent, logits = in_parts(batch.obs, uniform, batch.context, prev_action, batch.is_first)
     return Rollout(batch, embedding, latent, feature(latent), action, prev_action), logits
 
 
