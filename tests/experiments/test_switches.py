@@ -1,0 +1,90 @@
+"""Variants of a configuration side by side: what is trained, what is kept, and what is said of their difference."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from experiments import switches
+
+VARIANTS = ["agent.behavior.lam=0.95", "agent.behavior.lam=0.9,agent.behavior.horizon=5"]
+RETURNS = {VARIANTS[0]: [[1.0, 10.0], [2.0, 12.0], [0.0, 11.0]], VARIANTS[1]: [[5.0, 20.0], [4.0, 24.0], [6.0, 22.0]]}
+
+
+@pytest.fixture
+def invoke(monkeypatch, tmp_path):
+    trained = []
+
+    def train(config, variant, seeds):
+        trained.append((config.env.task, variant, config.agent.behavior.horizon))
+        for seed in range(seeds):
+            plain = switches.plain(config)
+            yield {"task": config.env.task, "variant": variant, "seeds": seed + 1, "config": plain} | {
+                "env_steps": [50, 100],
+                "curves": RETURNS[variant][: seed + 1],
+                "minutes": 1.0,
+            }
+
+    monkeypatch.setattr(switches, "train", train)
+
+    def call(*arguments):
+        done = CliRunner().invoke(switches.main, [str(tmp_path / "out.jsonl"), *arguments])
+        return done.exit_code, done.output, trained
+
+    return call
+
+
+def test_variants_are_trained_once_and_compared(invoke, tmp_path):
+    code, output, trained = invoke(*VARIANTS, "--seeds", "3", "--task", "dmc/cartpole_swingup")
+    assert code == 0, output
+    assert [(task, horizon) for task, _, horizon in trained] == [("dmc/cartpole_swingup", h) for h in (10, 5)]
+    assert "| 20 24 22 | 22.0 | 13.5 | +11.0 (" in output
+    assert "+7.5 (" in output
+    code, again, trained = invoke(*VARIANTS, "--seeds", "3", "--task", "dmc/cartpole_swingup")
+    assert len(trained) == 2, "what is there is not trained again"
+    assert again.splitlines()[-2:] == output.splitlines()[-2:]
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 2
+    invoke(VARIANTS[0], "--seeds", "3", "--task", "dmc/cartpole_swingup", "--set", "agent.behavior.discount=0.9")
+    assert len(trained) == 3, "another configuration is another line"
+
+
+def test_an_interval_holds_the_difference_that_there_is():
+    """Of 400 pairs of samples whose means differ by one, about 95 in 100."""
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(400):
+        text = switches.difference(rng.normal(1.0, 1.0, 5), rng.normal(0.0, 3.0, 8))
+        low, high = (float(x) for x in text.split("(")[1].rstrip(")").split(" to "))
+        held += low <= 1.0 <= high
+    assert 0.91 < held / 400 < 0.985
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["agent.behavior.lamda=0.9"], "lam"),
+        ([VARIANTS[0], "--task", "dmc/cartpole_swingpu"], "cartpole_swingup"),
+        ([], "Missing argument"),
+    ],
+)
+def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, message):
+    code, output, trained = invoke(*arguments)
+    assert code == 2
+    assert message in output
+    assert trained == []
+
+
+@pytest.mark.slow
+def test_a_variant_trains_each_seed_for_itself(tmp_path):
+    out = tmp_path / "out.jsonl"
+    small = ["--small", "--obs", "vector", "--preset", "smoke", "--task", "dmc/cartpole_balance"]
+    steps = ["--set", "loop.env_steps=2000", "--set", "loop.eval_every=1000"]
+    done = CliRunner().invoke(switches.main, [str(out), VARIANTS[0], *small, *steps, "--seeds", "2"])
+    assert done.exit_code == 0, done.output
+    (line,) = map(json.loads, out.read_text().splitlines())
+    curves = np.asarray(line["curves"])
+    assert line["env_steps"] == [1000, 2000]
+    assert curves.shape == (2, 2)
+    assert (curves > 0).all()
+    assert (curves[0] != curves[1]).any()
