@@ -1,8 +1,9 @@
 """Convolutions, lowered by platform.
 
 On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
-on a CPU, their gradients most of all, so there float32 work goes to `cpu_conv`: the same functions and gradients as
-matrix products over a few images at a time.
+on a CPU, their gradients most of all and in bfloat16 inside of loops (twenty times float32's), so there the work goes to
+`cpu_conv`: the same functions and gradients as matrix products over a few images at a time, in float32 whatever the
+dtype.
 
 On a mesh of CPU devices each takes its share of the images: the loop over chunks of a global array would otherwise run
 whole on every device.
@@ -37,8 +38,9 @@ def conv2d(x: Array, kernel: Array) -> Array:
             f"Expected x [N, H, W, C_in] and kernel [k, k, C_in, C_out] of one dtype, got {x.dtype} {list(x.shape)} "
             f"and {kernel.dtype} {list(kernel.shape)}."
         )
-    if on_cpu() and x.dtype == jnp.float32:
-        return parallel.per_shard(cpu_conv.conv2d, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)(x, kernel)
+    if on_cpu():
+        convolve = parallel.per_shard(cpu_conv.conv2d, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)
+        return convolve(x.astype(jnp.float32), kernel.astype(jnp.float32)).astype(x.dtype)
     return lax_conv2d(x, kernel)
 
 
@@ -81,7 +83,7 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
 
     uint8 images become ``image / 255 - 0.5``; images of a floating dtype are taken as they are, and can be
     differentiated for. A stage is a convolution (stride 1, SAME, bias), a 2x2 max-pool, an RMSNorm over channels in
-    float32 and SiLU; products are computed in ``dtype``. The gradient of a maximum that several outputs share goes to
+    float32 and SiLU; products are computed in ``dtype``, on a CPU in float32. The gradient of a maximum that several outputs share goes to
     the first of them on a CPU, and is divided among them elsewhere. Raises ValueError where the sides can't be halved
     once a stage.
     """
@@ -91,9 +93,9 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
             f"Expected images [N, H, W, C] with H and W multiples of {factor}, for {len(stages)} stages that halve "
             f"them, got {list(images.shape)}. Resize the images or use fewer stages."
         )
-    if on_cpu() and jnp.dtype(dtype) == jnp.float32 and all(cpu_conv.encodes(stage.kernel) for stage in stages):
+    if on_cpu() and all(cpu_conv.encodes(stage.kernel) for stage in stages):
         encode = parallel.per_shard(cpu_conv.encode_images, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)
-        return encode(images, stages)
+        return encode(images, stages).astype(dtype)
     return lax_encode_images(images, stages, dtype)
 
 
