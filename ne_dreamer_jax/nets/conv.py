@@ -1,7 +1,7 @@
 """Convolutions, lowered by platform.
 
 On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
-on a CPU, their gradients most of all and in bfloat16 inside of loops (twenty times float32's), so there the work goes to
+on a CPU, their gradients most of all and in bfloat16 inside of loops (twenty times float32's). There the work goes to
 `cpu_conv`: the same functions and gradients as matrix products over a few images at a time, in float32 whatever the
 dtype.
 
@@ -83,9 +83,9 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
 
     uint8 images become ``image / 255 - 0.5``; images of a floating dtype are taken as they are, and can be
     differentiated for. A stage is a convolution (stride 1, SAME, bias), a 2x2 max-pool, an RMSNorm over channels in
-    float32 and SiLU; products are computed in ``dtype``, on a CPU in float32. The gradient of a maximum that several outputs share goes to
-    the first of them on a CPU, and is divided among them elsewhere. Raises ValueError where the sides can't be halved
-    once a stage.
+    float32 and SiLU; products are computed in ``dtype``, on a CPU in float32. The gradient of a maximum that several
+    outputs share goes to the first of them on a CPU, and is divided among them elsewhere. Raises ValueError where the
+    sides can't be halved once a stage.
     """
     factor = 2 ** len(stages)
     if images.ndim != 4 or any(side % factor for side in images.shape[1:3]):
