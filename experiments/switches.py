@@ -10,6 +10,7 @@ agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 EVALUATION = 2**31 - 1
 """The seed of the episodes of evaluations."""
+SETTING = re.compile(r",(?=[\w.]+=)")
+"""What parts a variant's settings: a comma before the next one's name, as values may hold commas, too."""
 SMALL = (
     "agent.rssm.deter=128",
     "agent.rssm.hidden=64",
@@ -36,9 +39,8 @@ SMALL = (
     "agent.rssm.classes=8",
     "agent.heads.units=64",
     "agent.encoder.units=64",
-    "agent.objective.predictor.width=64",
 )
-"""The quickstart's agent made small enough for vectors, with --small: some 0.2M parameters."""
+"""The quickstart's agent made small enough for vectors, with --small: some 0.3M parameters."""
 
 
 @click.command(help=__doc__, context_settings={"show_default": True, "max_content_width": 110})
@@ -72,25 +74,30 @@ def main(
     with refusing(ValueError):
         made = {
             (task, variant): configure(
-                preset, None, method, {"env.task": task, "env.obs": obs}, (*common, *variant.split(","))
+                preset, None, method, {"env.task": task, "env.obs": obs}, (*common, *SETTING.split(variant))
             )
             for task in tasks or (None,)
             for variant in variants
         }
     lines = _read(out)
+    compared: list[dict[str, Any]] = []
     for (_, variant), config in made.items():
-        if _find(lines, config, variant, seeds) is not None:
-            continue
-        say(f"{config.env.task}, {variant}: {seeds} seeds")
-        for line in train(config, variant, seeds):
-            say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
-        lines.append(line)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with out.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        compared.append(_find(lines, config, variant, seeds) or _add(out, config, variant, seeds))
     say("")
-    for row in table(lines):
+    for row in table(compared):
         say(row)
+
+
+def _add(out: Path, config: Config, variant: str, seeds: int) -> dict[str, Any]:
+    """Trains a variant, and adds its line to the file."""
+    say(f"{config.env.task}, {variant}: {seeds} seeds")
+    line: dict[str, Any] = {}
+    for line in train(config, variant, seeds):
+        say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("a") as file:
+        file.write(json.dumps(line) + "\n")
+    return line
 
 
 def train(config: Config, variant: str, seeds: int) -> Iterator[dict[str, Any]]:
@@ -146,7 +153,7 @@ def _find(lines: Sequence[dict[str, Any]], config: Config, variant: str, seeds: 
 
 
 def table(lines: Sequence[dict[str, Any]]) -> list[str]:
-    """A Markdown table: of each task and variant the returns, and the difference from the task's first variant."""
+    """A Markdown table: of each line's returns, and their difference from those of the first line of its task."""
     import numpy as np
 
     rows = [
@@ -171,7 +178,7 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def difference(values: np.ndarray, others: np.ndarray) -> str:
-    """Difference of two means with its 95 % interval (Welch), as text."""
+    """Difference of two means with its 95 % interval (Welch), as text. Needs scipy (the extra ``analysis``)."""
     from scipy import stats
 
     found = stats.ttest_ind(values, others, equal_var=False)

@@ -137,11 +137,11 @@ def moved() -> dict[str, bool]:
 
 
 def whole_agent() -> dict[str, Any]:
-    """Losses of the whole agent's updates in the loop, on 1 and on 8 devices."""
+    """Losses of the whole agent's updates in the loop, on 1 and on 8 devices, and on 8 in two microbatches."""
     env = counting.env(image=True)
-    config = dataclasses.replace(tiny.CONFIG, batch_size=B, batch_length=4)
     out: dict[str, Any] = {}
-    for devices in (1, 8):
+    for devices, parts in ((1, 1), (8, 1), (8, 2)):
+        config = dataclasses.replace(tiny.CONFIG, batch_size=2 * B, batch_length=4, microbatches=parts)
         agent = agents.make_agent(config, env.spec)
         mesh = None if devices == 1 else parallel.make_mesh(devices)
         loop = loops.make(dataclasses.replace(CONFIG, replay_ratio=2.0), env, agent, 1, mesh)
@@ -154,7 +154,7 @@ def whole_agent() -> dict[str, Any]:
         for _ in range(STEPS):
             state, metrics = loop.chunk(state, np.asarray(1, np.int32))
             curve.append({name: float(value) for name, value in metrics.items() if name.startswith("loss/")})
-        out[str(devices)] = curve
+        out[f"{devices} in {parts}"] = curve
     return out
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.loop import placement
 from ne_dreamer_jax.runs import metrics
 from ne_dreamer_jax.system import parallel
 from tests import counting
@@ -72,12 +73,13 @@ def test_checkpoints_move_between_numbers_of_devices(computed):
 def test_the_whole_agents_losses_are_those_of_one_device():
     """Barlow Twins standardises over the global batch, or its loss would differ by far more."""
     computed = compute("whole_agent")
-    one, eight = (computed["whole_agent"][devices] for devices in ("1", "8"))
+    one, eight, in_parts = (computed["whole_agent"][devices] for devices in ("1 in 1", "8 in 1", "8 in 2"))
     learned = 0
-    for a, b in zip(one, eight, strict=True):
-        assert set(a) == set(b)
+    for a, b, c in zip(one, eight, in_parts, strict=True):
+        assert set(a) == set(b) == set(c)
         for name in a:
             np.testing.assert_allclose(b[name], a[name], rtol=1e-4, atol=1e-5, err_msg=name)
+            np.testing.assert_allclose(c[name], a[name], rtol=1e-4, atol=1e-5, err_msg=name)
         learned += np.isfinite(a["loss/next_embedding"])
     assert learned > 10
 
@@ -127,6 +129,15 @@ def test_shares_must_be_equal(changes):
     config = loops.LoopConfig(num_envs=changes.get("num_envs", 2))
     with pytest.raises(ValueError, match=r"expected a multiple of the 2 devices, got 3"):
         loops.make(config, env, agent, 1, TwoDevices())
+
+
+def test_every_device_has_its_share_of_every_microbatch():
+    class TwoDevices:
+        size = 2
+
+    assert placement.check_divisible(TwoDevices(), 2, 8, 4) == 2
+    with pytest.raises(ValueError, match=r"expected 4 parts of agent\.batch_size 4 that the 2 devices divide"):
+        placement.check_divisible(TwoDevices(), 2, 4, 4)
 
 
 def test_devices_that_are_not_there_are_refused():

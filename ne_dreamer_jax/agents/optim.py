@@ -77,7 +77,9 @@ def clip_per_tensor(
 def whole_tensor(path: Path) -> Path:
     """The tensor of the published networks that a leaf of ours is part of (`rssm.PARTS_OF_ONE_TENSOR`)."""
     names: list[Any] = [getattr(entry, "key", entry) for entry in path]
-    return tuple(PARTS_OF_ONE_TENSOR.get(name, name) for name in names)
+    if names[:1] == ["rssm"]:
+        names[-1] = PARTS_OF_ONE_TENSOR.get(names[-1], names[-1])
+    return tuple(names)
 
 
 class WeightedAverage(NamedTuple):

@@ -75,7 +75,8 @@ def make(config: LoopConfig, env: Any, agent: Agent, action_repeat: int, mesh: M
     of an environment whose images can't be drawn again, or images on the host where there are none or several
     processes, or where devices can't get equal shares.
     """
-    devices = placement.check_divisible(mesh, config.num_envs, agent.config.batch_size)
+    microbatches = getattr(agent.config, "microbatches", 1)  # DrQ-v2 has none
+    devices = placement.check_divisible(mesh, config.num_envs, agent.config.batch_size, microbatches)
     venv = as_vector(env)
     if venv.host is not None and mesh is not None:
         raise ValueError("expected one device for environments in worker processes; leave out --devices and a mesh")

@@ -19,10 +19,15 @@ def shardings(mesh: Mesh, shapes: LoopState) -> LoopState:
     return parallel.shardings(mesh, LoopState(**specs), shapes)
 
 
-def check_divisible(mesh: Mesh | None, num_envs: int, batch_size: int) -> int:
-    """The number of devices. Raises ValueError where they can't get equal shares."""
+def check_divisible(mesh: Mesh | None, num_envs: int, batch_size: int, microbatches: int = 1) -> int:
+    """The number of devices. Raises ValueError where they can't get equal shares of environments and microbatches."""
     devices = 1 if mesh is None else mesh.size
     for name, count in (("loop.num_envs", num_envs), ("agent.batch_size", batch_size)):
         if count % devices:
             raise ValueError(f"{name}: expected a multiple of the {devices} devices, got {count}.")
+    if batch_size % (devices * microbatches):
+        raise ValueError(
+            f"agent.microbatches: expected {microbatches} parts of agent.batch_size {batch_size} that the {devices} "
+            f"devices divide; with as many devices at most {batch_size // devices} are of use."
+        )
     return devices

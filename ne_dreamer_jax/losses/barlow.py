@@ -35,7 +35,8 @@ def barlow_twins(
       redundancy: :math:`\lambda`.
       eps: added to each variance, so that a constant dimension correlates with nothing instead of giving NaN.
       sample_deviation: standardise by the sample's standard deviation (N - 1), to which ``eps`` is added, as the
-        authors' released code does: with perfect predictions :math:`C_{ii}` is then 1 - 1/N.
+        authors' released code does: with perfect predictions :math:`C_{ii}` is then 1 - 1/N. It protects less: of a
+        dimension that is constant but for rounding it makes correlations, and very large gradients.
 
     Returns:
       The loss, float32 ``[]``, and metrics without gradient: ``diagonal`` (mean of :math:`C_{ii}`), ``off_diagonal``

@@ -19,7 +19,8 @@ def in_microbatches(
     gradient is kept for one part at a time and computed again when its turn comes, which costs another forward pass
     (gradient accumulation, with the loss still taken over the whole).
 
-    A part takes every ``count``-th row, so that rows that are divided among devices stay where they are.
+    A part takes every ``count``-th row, so that rows that are divided among devices stay where they are, if each device
+    has a multiple of ``count``.
 
     Args:
       function: of arrays with a batch axis, to arrays with one.

@@ -21,7 +21,7 @@ class Model(NamedTuple):
     """(params, key, batch) -> encodes a batch and unrolls the posterior along it; images may be float32, as the
     encoder's stages take them. For objectives that look at other views of the observations."""
     microbatches: int = 1
-    """Parts in which sequences go through an objective's own networks, see `nets.microbatches`."""
+    """Parts in which sequences go through an objective's own large networks; see `nets.microbatches`."""
 
 
 class Objective(NamedTuple):

@@ -45,8 +45,8 @@ class NextEmbedding:
     across_episodes: bool = False
     """Whether attention reaches back beyond the start of the episode (the released code)."""
     unshifted_token: Literal["action", "state"] = "action"
-    """Which token of step t predicts the embedding of that same step, where ``shift`` is 0: the action's, as for all
-    later ones, or the state's, which does not see a_t (the released code)."""
+    """At which token of step t predictions are read where ``shift`` is 0: the action's, as otherwise, or the state's,
+    which does not see a_t (the released code)."""
 
     def __post_init__(self) -> None:
         ranges.check(self)

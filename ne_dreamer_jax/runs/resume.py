@@ -20,6 +20,10 @@ MAY_CHANGE = ("loop.eval_every", "loop.eval_episodes", "loop.eval_max_steps", "l
 is learned: the same bits come out with any."""
 
 
+MAY_DIFFER = ("microbatches",)
+"""Settings of the agent that may change, too, with which the same update is computed in another order of additions."""
+
+
 def settle(path: Path, asked: Config) -> Config:
     """The configuration with which the run in a directory goes on; the one asked for where there is none.
 
@@ -51,6 +55,9 @@ def differences(stored: Config, asked: Config) -> list[str]:
         names.append("capacity")
     agreed: Any = {name: getattr(asked.loop, name) for name in names}
     agreed = replace(stored, loop=replace(stored.loop, **agreed))
+    if type(stored.agent) is type(asked.agent):
+        shared = {name: getattr(asked.agent, name) for name in MAY_DIFFER if hasattr(asked.agent, name)}
+        agreed = replace(agreed, agent=replace(stored.agent, **shared))
     if isinstance(stored.env, WorkersConfig) and type(stored.env) is type(asked.env):
         workers: Any = {field.name: getattr(asked.env, field.name) for field in fields(WorkersConfig)}
         agreed = replace(agreed, env=replace(stored.env, **workers))

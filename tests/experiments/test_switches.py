@@ -45,8 +45,18 @@ def test_variants_are_trained_once_and_compared(invoke, tmp_path):
     assert len(trained) == 2, "what is there is not trained again"
     assert again.splitlines()[-2:] == output.splitlines()[-2:]
     assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 2
-    invoke(VARIANTS[0], "--seeds", "3", "--task", "dmc/cartpole_swingup", "--set", "agent.behavior.discount=0.9")
+    other = ["--seeds", "3", "--task", "dmc/cartpole_swingup", "--set", "agent.behavior.discount=0.9"]
+    _, output, trained = invoke(VARIANTS[1], *other)
     assert len(trained) == 3, "another configuration is another line"
+    assert "| 20 24 22 | 22.0 | 13.5 |  |  |" in output, "and compared with none of an earlier command"
+    assert VARIANTS[0] not in output
+
+
+def test_a_variant_may_be_of_another_method_and_have_values_with_commas(invoke, monkeypatch):
+    variant = "agent.behavior.return_percentiles=10,95,agent.behavior.lam=0.9"
+    monkeypatch.setitem(RETURNS, variant, RETURNS[VARIANTS[0]])
+    code, output, trained = invoke(variant, "--small", "--method", "r2dreamer", "--seeds", "2")
+    assert (code, len(trained)) == (0, 1), output
 
 
 def test_an_interval_holds_the_difference_that_there_is():

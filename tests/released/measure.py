@@ -13,7 +13,7 @@ from ne_dreamer_jax.agents import optim
 from tests.released import names, setting
 
 ROUND_OFF = 1e-4
-"""Gradients below are, next to the largest of some tens."""
+"""Gradients below this are round-off, beside the largest of some tens."""
 
 
 def run(method: str, actions: str) -> setting.Run:

@@ -79,9 +79,10 @@ class AgentConfig:
     batch_length: Annotated[int, Range(1, 1_000_000)] = 64
     """T, steps in a sequence."""
     microbatches: Count = 1
-    """Parts in which an update's sequences, and the trajectories imagined from them, go through the networks one after
-    the other. The update is the same, its losses are taken over the whole batch; of what the gradient needs there is
-    one part in memory at a time, for one more forward pass. Divides ``batch_size``."""
+    """Parts in which an update's sequences, and the trajectories imagined from them, go one after the other through
+    what takes most memory: encoder, recurrence, predictor or decoder, and imagination. The update is the same, its
+    losses are taken over the whole batch; of what those need for the gradient there is one part in memory at a time,
+    for one more forward pass. Divides ``batch_size``."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32."""
 
