@@ -130,7 +130,14 @@ def smoke(size: str) -> Config:
     """A minute or two on a CPU: touches everything, learns nothing."""
     agent = replace(agent_config(size), batch_size=4, batch_length=16)
     loop = LoopConfig(
-        env_steps=4_400, num_envs=4, replay_ratio=2.0, prefill=400, chunk_steps=50, eval_every=2_200, eval_episodes=1
+        env_steps=4_400,
+        num_envs=4,
+        replay_ratio=2.0,
+        prefill=400,
+        chunk_steps=50,
+        eval_every=2_200,
+        eval_episodes=1,
+        max_skipped=10,  # of some fifty updates
     )
     return Config(DmcConfig("dmc/cartpole_balance"), agent, loop)
 

@@ -144,7 +144,7 @@ def whole_agent() -> dict[str, Any]:
         config = dataclasses.replace(tiny.CONFIG, batch_size=2 * B, batch_length=4, microbatches=parts)
         agent = agents.make_agent(config, env.spec)
         mesh = None if devices == 1 else parallel.make_mesh(devices)
-        loop = loops.make(dataclasses.replace(CONFIG, replay_ratio=2.0), env, agent, 1, mesh)
+        loop = loops.make(dataclasses.replace(CONFIG, replay_ratio=4.0), env, agent, 1, mesh)
         # The parameters come from numpy; compiling their initialisation would take longer than all the rest.
         rest = stub_loop(1).init(jax.random.key(0))
         shapes = loop.state_shapes()
@@ -152,8 +152,9 @@ def whole_agent() -> dict[str, Any]:
         start = rest._replace(train=tiny.state(agent), policy=agent.init_policy(N), replay=replay)
         state, curve = parallel.move(start, shapes), []
         for _ in range(STEPS):
-            state, metrics = loop.chunk(state, np.asarray(1, np.int32))
-            curve.append({name: float(value) for name, value in metrics.items() if name.startswith("loss/")})
+            state, report = loop.chunk(state, np.asarray(1, np.int32))
+            means = jax.device_get(report).means()
+            curve.append({name: value for name, value in means.items() if name.startswith("loss/")})
         out[f"{devices} in {parts}"] = curve
     return out
 

@@ -91,9 +91,9 @@ def read(path: Path) -> list[dict[str, Any]]:
         checked = checked or (line is not None and CHECKSUM in line)
         if line is None or (checked and line.pop(CHECKSUM, None) != _checksum(line)):
             raise ValueError(
-                f"{path}, line {number}: expected a JSON object with {', '.join(COUNTERS)}, and numbers as "
-                f"they were written, got {text.decode(errors='replace').strip()[:80]!r}. Remove the line, or restore "
-                "the file"
+                f"{path}, line {number}: expected a JSON object with {', '.join(COUNTERS)} whose checksum fits, got "
+                f"{text.decode(errors='replace').strip()[:80]!r}. Remove the line (the others say "
+                "all they said), or restore the file"
             )
         lines.append({name: math.nan if value is None else value for name, value in line.items()})
     return lines

@@ -91,12 +91,12 @@ class Pace:
             parts.append(f"episodes cut by actions that are not finite: {values['train/bad_actions']:.0f}")
         if values.get("train/faults"):
             parts.append(f"episodes cut by faults of the environment: {values['train/faults']:.0f}")
-        parts.append(self._left(step))
+        parts.append(self._left(step, after))
         return "  ".join(parts)
 
-    def _left(self, step: int) -> str:
+    def _left(self, step: int, after: StepCounts) -> str:
         if not self._chunks:
-            return "collecting before the first update"
+            return "time left not known yet" if after.update else "collecting before the first update"
         steps = (self._schedule.total - step) * statistics.median(self._chunks)
         return f"{duration(steps + self._evaluation * self._schedule.evaluations_after(step))} left"
 

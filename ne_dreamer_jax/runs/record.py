@@ -89,14 +89,14 @@ class Saves:
         """Whether the interval is over."""
         return bool(parallel.agreed(time.monotonic() - self._last >= self._seconds)[0])
 
-    def whole(self, state: LoopState, counters: StepCounts, score: float | None) -> None:
-        """Saves everything, unless it stands there already."""
+    def whole(self, state: LoopState, counters: StepCounts, score: float | None, goes_on: bool = True) -> None:
+        """Saves everything, unless it stands there already; ``goes_on`` is whether training does, if that fails."""
         if parallel.agreed(not any(found.score == score for found in self._whole_at(counters)))[0]:
             rest: Any = ()
             items: dict[str, Any] = {"agent": state.train, "loop": state._replace(train=rest)}
             if self._frames is not None:
                 items["frames"] = self._frames.arrays
-            self._save(items, counters, score)
+            self._save(items, counters, score, goes_on)
         self._last = time.monotonic()
 
     def if_best(self, state: LoopState, counters: StepCounts, score: float | None) -> None:
@@ -113,7 +113,7 @@ class Saves:
         found = checkpoint.checkpoints(self._directory)
         return [entry for entry in found if entry.step == counters.env_step and set(self._items) <= set(entry.items)]
 
-    def _save(self, items: dict[str, Any], counters: StepCounts, score: float | None) -> None:
+    def _save(self, items: dict[str, Any], counters: StepCounts, score: float | None, goes_on: bool = True) -> None:
         began = time.monotonic()
         if jax.process_count() > 1:
             items = parallel.gather(items)
@@ -123,10 +123,8 @@ class Saves:
             checkpoint.save(self._directory, counters.env_step, items, score=score)
         except checkpoint.SaveError as error:
             self.failed = True
-            self._echo(
-                f"Not saved: {error}. Training goes on, and the next attempt is at the next interval. "
-                f"{last(self._files, self._frames)}"
-            )
+            then = "Training goes on, and the next attempt is at the next interval. " if goes_on else ""
+            self._echo(f"Not saved: {error}. {then}{last(self._files, self._frames)}")
             return
         self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")

@@ -160,9 +160,9 @@ def claim(path: Path, config: Any, differences: Differences = settings.differenc
     files = RunDirectory(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        marker = files.marker.open("a+", encoding="utf-8")
+        marker = files.marker.open("ab", buffering=0)
     except OSError as error:
-        raise RefusedError(f"{path} can't be made a run directory: {error}") from error
+        raise RefusedError(f"{path} can't be made a run directory: {error.strerror or error}") from error
     with marker:
         try:
             fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -176,13 +176,12 @@ def claim(path: Path, config: Any, differences: Differences = settings.differenc
         check_same(path, config, differences)
         try:
             if not files.config.exists():
-                marker.write(_MARKER_TEXT)
-                marker.flush()
+                marker.write(_MARKER_TEXT.encode())
                 store_config(files, config)
             elif read_config(path, type(config)) != config:
                 store_config(files, config)
         except OSError as error:
-            raise RefusedError(f"{files.config} can't be written: {error.strerror or error}") from error
+            raise RefusedError(f"{path} can't be written to: {error.strerror or error}") from error
         yield files
 
 

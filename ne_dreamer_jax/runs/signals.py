@@ -66,7 +66,8 @@ class Stop:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with contextlib.suppress(RuntimeError):  # it came in the middle of another line
             self._echo(
-                "\nStopping when this chunk is done, to save a checkpoint. A second time stops at once, without."
+                "\nStopping when this chunk, or its compilation, is done, to save a checkpoint. A second time stops at "
+                "once, without."
             )
 
     def _is_second(self) -> bool:

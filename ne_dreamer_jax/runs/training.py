@@ -169,7 +169,7 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
             if step == schedule.total or stopped_by:
                 break
             if chunk is None:
-                chunk = _compile(run, state, echo)
+                chunk = _compile(run, echo)
                 continue  # in case that somebody wished to stop meanwhile
             steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
             began = time.perf_counter()
@@ -189,10 +189,13 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
                 return ENVIRONMENT
             if saves.due():
                 saves.whole(state, counters, record.score(counters))
-        saves.whole(state, counters, record.score(counters))
+        saves.whole(state, counters, record.score(counters), goes_on=False)
         if step < schedule.total:
+            if saves.failed:
+                echo(f"Stopped after {counters.env_step:,} environment steps, of which the last are lost: see above.")
+                return NOT_SAVED
             echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
-            return NOT_SAVED if saves.failed else 128 + stopped_by
+            return 128 + stopped_by
     return _finish(run, files, state, evaluation_key, record, saves, frames, echo) if is_main_process else 0
 
 
@@ -222,7 +225,7 @@ def _finish(
             lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
         )
     draw(run, files, record, echo)
-    for line in _conclusion(run, files, record):
+    for line in _conclusion(run, files, record, int(state.counters.skipped)):
         echo(line)
     if saves.failed:
         echo(f"The end of this run is not saved. Make room in {files.path}, and give the same command again.")
@@ -342,7 +345,8 @@ def _space(run: Run, files: RunDirectory) -> str:
     each = sum(checkpoint.nbytes({"item": item}) for item in items)
     free = checkpoint.free_space(files.path)
     # Two whole ones stand at a time, and one is being written.
-    enough = "" if 3 * each <= free else " WARNING: that is too little for three, which there are at times"
+    wanted = "three, as there are at times" if each <= free else "one"
+    enough = "" if 3 * each <= free else f" WARNING: that is too little for {wanted}"
     return (
         f"A checkpoint takes up to {memory.readable(each)}; {memory.readable(free)} are free in {files.path}.{enough}"
     )
@@ -356,12 +360,13 @@ def _same_for_all(files: RunDirectory, env_step: int) -> None:
         )
 
 
-def _compile(run: Run, state: LoopState, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
+def _compile(run: Run, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
     draws = "and draw " if images_of(run.agent.spec) else ""
     echo(f"Compiling the training chunk: act, step {draws}the environments, store, sample, update.")
     jitted: Any = run.loop.chunk
     began = time.perf_counter()
-    lowered = jitted.lower(state, jnp.zeros((), jnp.int32))
+    # Of shapes, not of the state: one that was restored lies where it was put, and would make another program of it.
+    lowered = jitted.lower(run.shapes, jax.ShapeDtypeStruct((), jnp.int32))
     traced = time.perf_counter()
     with compile_cache.hits() as hits:
         compiled = lowered.compile()
@@ -390,8 +395,9 @@ def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, e
     echo(
         f"Stopped: {int(state.counters.skipped):,} updates in a row were not finite (loop.max_skipped is "
         f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. "
-        f"{last(files, run.loop.frames)} Try a lower agent.optimizer.learning_rate or agent.optimizer.agc, look at the "
-        "size of the rewards, or set JAX_DEBUG_NANS=True to find the first operation."
+        f"{last(files, run.loop.frames)} This command would come to the same point again: begin a new run, with --fork "
+        f"{typed(files.path)} from that checkpoint or from the start, with a lower agent.optimizer.learning_rate or "
+        "agent.optimizer.agc; look at the size of the rewards; or set JAX_DEBUG_NANS=True to find the first operation."
     )
     return DIVERGED
 
@@ -423,11 +429,16 @@ def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
     return {f"{prefix}return": mean, f"{prefix}return_std": deviation}
 
 
-def _conclusion(run: Run, files: RunDirectory, record: Record) -> list[str]:
+def _conclusion(run: Run, files: RunDirectory, record: Record, in_a_row: int) -> list[str]:
     mean, deviation = record.find("eval/return"), record.find("eval/return_std")
     lines = [f"Finished {run.config.loop.env_steps:,} environment steps of {run.config.env.task}."]
     if run.loop.budget.updates == 0:
         lines.append(progress.NOTHING_LEARNED)
+    if skipped := sum(line.get("train/skipped_updates", 0) for line in record.lines):
+        lines.append(
+            f"{skipped:,.0f} of {run.loop.budget.updates:,} updates were skipped, as their numbers were not finite; "
+            f"{in_a_row:,} of them in a row at the end."
+        )
     if mean is not None and deviation is not None and record.random_return is not None:
         lines.append(
             f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "

@@ -49,6 +49,7 @@ def test_ten_moments(tmp_path):
         print(f"{number.name} at {moment!r}: left after {seconds:.2f} s, at step {newest(path)[0]}")
         code, said, errors, _ = run(path)
         assert (code, errors) == (0, ""), said
+        assert "loaded from the cache" in said, "a resumed run is the same program as a fresh one"
         assert newest(path) == newest(tmp_path / "whole"), moment
 
 

@@ -97,3 +97,32 @@ def test_metrics_that_can_not_be_written_end_nothing():
     assert "No space left on device. Training goes on" in said[0]
     assert record.find("train/return") == 2.0
     full.close()  # says nothing more
+
+
+def test_a_file_system_that_is_full_from_the_start_is_said_in_one_sentence(tmp_path, monkeypatch):
+    """Nothing is left in a buffer, which would be written, and fail, once more when the file is closed."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / run_directory.MARKER).symlink_to("/dev/full")
+    with (
+        pytest.raises(run_directory.RefusedError, match="run can't be written to: No space left on device"),
+        run_directory.claim(tmp_path / "run", toy.config()),
+    ):
+        pass
+
+
+def test_a_save_that_fails_at_the_end_promises_nothing(tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(checkpoint, "save", raising(checkpoint.SaveError("no room")))
+    run = stub.build(toy.config(env_steps=40, eval_every=None), image=False)
+    with run_directory.claim(tmp_path / "run", run.config) as files:
+        assert training.train(run, files, checkpoint_minutes=60, echo=said.append) == training.NOT_SAVED
+    refused = [line for line in said if line.startswith("Not saved: no room.")]
+    assert refused
+    assert "Training goes on" not in refused[-1]
+
+
+def raising(error):
+    def call(*_, **__):
+        raise error
+
+    return call
