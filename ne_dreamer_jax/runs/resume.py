@@ -70,7 +70,8 @@ def changes(path: Path, asked: Config) -> list[str]:
     """What is other than when the run in a directory was last started, a line each; empty where there is none."""
     if not RunDirectory(path).config.exists():
         return []
-    return settings.differences(run_directory.read_config(path, Config), asked)
+    lines = settings.differences(run_directory.read_config(path, Config), asked)
+    return [f"{line} (replay keeps its size)" if line.startswith("loop.capacity: None") else line for line in lines]
 
 
 def _capacity(config: Config) -> int:

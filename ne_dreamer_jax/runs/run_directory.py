@@ -139,8 +139,9 @@ def check_same(path: Path, config: Any, differences: Differences = settings.diff
     different = differences(read_config(path, type(config)), config)
     if different:
         raise RefusedError(
-            f"{path} holds another run. Give it the same options to go on, choose another --logdir, or begin a new run "
-            f"there from this one's agent with --fork {typed(path)}. They differ in\n  " + "\n  ".join(different)
+            f"{path} holds another run, or one with other settings. Give it the same options to go on, choose another "
+            f"--logdir, or begin a new run in another directory from this one's agent with --fork {typed(path)}. They "
+            "differ in\n  " + "\n  ".join(different)
         )
 
 
