@@ -1,7 +1,7 @@
 """What a setting is worth: variants of one configuration, several seeds each, and the interval of their difference.
 
 A variant is one or more settings, joined by commas; the first is what the others are compared with. Its seeds train one
-after the other in one compiled program: on a CPU that is faster than all of them at once under ``vmap``.
+after the other, in one compiled program.
 
 Usage: ``python -m experiments.switches runs/head.jsonl agent.behavior.discount_in_head=true
 agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
