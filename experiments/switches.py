@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from ne_dreamer_jax.config import Config
 
-EVALUATION = 2**31 - 1
-"""The seed of the episodes of evaluations."""
 SETTING = re.compile(r",(?=[\w.]+=)")
 """What parts a variant's settings: a comma before the next one's name, as values may hold commas, too."""
 SMALL = (
@@ -40,7 +38,7 @@ SMALL = (
     "agent.heads.units=64",
     "agent.encoder.units=64",
 )
-"""The quickstart's agent made small enough for vectors, with --small: some 0.3M parameters."""
+"""The quickstart's agent made small enough for vectors, with --small."""
 
 
 @click.command(help=__doc__, context_settings={"show_default": True, "max_content_width": 110})
@@ -107,6 +105,7 @@ def train(config: Config, variant: str, seeds: int) -> Iterator[dict[str, Any]]:
     import numpy as np
 
     import ne_dreamer_jax as nedreamer
+    from experiments.probes import EVALUATION
     from ne_dreamer_jax import loop as loops
     from ne_dreamer_jax.envs import config as env_configs
 

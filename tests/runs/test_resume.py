@@ -88,6 +88,15 @@ def test_what_is_measured_may_change_and_what_is_learned_does_not(stopped, tmp_p
     assert run_directory.read_config(stopped, configs.Config) == changed
 
 
+def test_an_update_may_go_on_in_other_parts():
+    """The same update, for a device with less memory."""
+    stored = toy.config()
+    asked = replace(stored, agent=replace(stored.agent, microbatches=2))
+    assert resume.differences(stored, asked) == []
+    other = replace(stored, agent=replace(asked.agent, batch_length=5))
+    assert resume.differences(stored, other) == ["agent.batch_length: 4, now 5"]
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
