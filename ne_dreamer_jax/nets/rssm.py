@@ -211,5 +211,8 @@ def observe(
         return latent, (latent, logits)
 
     inputs = jax.tree.map(time_major, (observation_in, action_in, is_first, uniform))
-    _, outputs = jax.lax.scan(step, context, inputs)
+    # Only products are kept for the gradient: each array that is kept is stored by itself in every step, which on an
+    # accelerator costs more than to compute it again.
+    keep_products = jax.checkpoint(step, policy=jax.checkpoint_policies.dots_saveable, prevent_cse=False)
+    _, outputs = jax.lax.scan(keep_products, context, inputs)
     return jax.tree.map(time_major, outputs)
