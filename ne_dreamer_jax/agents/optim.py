@@ -63,12 +63,13 @@ def clip_per_tensor(
         tensors: dict[Hashable, list[tuple[jax.Array, jax.Array]]] = {}
         for (path, gradient), parameter in zip(leaves, jax.tree.leaves(params), strict=True):
             tensors.setdefault(tensor(path), []).append((gradient, parameter))
-        divisors = {}
-        for name, parts in tensors.items():
-            gradients, parameters = zip(*parts, strict=True)
-            limit = clip * jnp.maximum(optax.tree.norm(parameters), pmin)
-            divisors[name] = jnp.maximum(optax.tree.norm(gradients) / limit, 1.0)
-        clipped = [gradient / divisors[tensor(path)] for path, gradient in leaves]
+        # All norms in one array, so that what follows is a few kernels in all and not a few for each tensor.
+        both = [list(zip(*parts, strict=True)) for parts in tensors.values()]  # gradients and parameters
+        squares = [optax.tree.norm(pair[i], squared=True) for i in (0, 1) for pair in both]
+        of_gradients, of_parameters = jnp.sqrt(jnp.stack(squares)).reshape(2, -1)
+        divisors = jnp.maximum(of_gradients / (clip * jnp.maximum(of_parameters, pmin)), 1.0)
+        of_tensor = dict(zip(tensors, jnp.split(divisors, len(tensors)), strict=True))
+        clipped = [gradient / of_tensor[tensor(path)].reshape((1,) * gradient.ndim) for path, gradient in leaves]
         return jax.tree.unflatten(structure, clipped), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)

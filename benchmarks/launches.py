@@ -1,0 +1,208 @@
+"""Counts the kernels of an update, for a GPU that need not be there: ``python -m benchmarks.launches --help``.
+
+Where kernels are short, what decides on a GPU is how many are launched. The update is compiled ahead of time, and the
+optimised program is read: every instruction of it that computes or copies is a kernel, and those in a loop's body count
+once for each of its steps.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import click
+
+from ne_dreamer_jax.commands.options import Name, refusing
+from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.quiet import quiet
+
+TARGETS = ("cuda", "cpu")
+FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all", "opt-barrier"}
+"""Instructions that launch nothing."""
+COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.\-]+) \(.*\) -> .* \{$")
+INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?[\w.\-]+ = (.*)$")
+
+H100 = """
+gpu_device_info {
+  threads_per_block_limit: 1024  threads_per_warp: 32
+  shared_memory_per_block: 49152  shared_memory_per_core: 233472  shared_memory_per_block_optin: 232448
+  threads_per_core_limit: 2048  core_count: 132  fpus_per_core: 128
+  block_dim_limit_x: 2147483647  block_dim_limit_y: 65535  block_dim_limit_z: 65535
+  memory_bandwidth: 3352320000000  l2_cache_size: 52428800
+  clock_rate_ghz: 1.98  device_memory_size: 84929347584
+  cuda_compute_capability { major: 9 }
+  registers_per_core_limit: 65536  registers_per_block_limit: 65536
+}
+platform_name: "CUDA"
+dnn_version_info { major: 9 minor: 8 }
+runtime_version { major: 12 minor: 9 patch: 0 }
+device_description_str: "NVIDIA H100 80GB HBM3"
+"""
+"""An H100 as XLA's target configurations describe one."""
+
+
+class Part(NamedTuple):
+    """The program outside of loops, a loop's body, or a branch of a conditional."""
+
+    name: str
+    steps: int  # how often it runs in an update; 1 where the program does not say
+    kernels: Counter[str]  # kind -> launches in one of its steps
+
+    @property
+    def launches(self) -> int:
+        """In all steps together."""
+        return self.steps * sum(self.kernels.values())
+
+
+@click.command(context_settings={"max_content_width": 110})
+@click.option("--size", type=Name("size", names.SIZES), default="12m", show_default=True)
+@click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
+@click.option("--target", type=Name("target", TARGETS), default="cuda", show_default=True)
+@click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
+@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
+def main(size: str, method: str, target: str, actions: int, assignments: tuple[str, ...]) -> None:
+    """Count the kernels of an update on 64x64x3 frames (drqv2: 84x84x3), by loop.
+
+    --target cuda compiles for an H100, without one; it needs the packages of the extra `cuda` and a minute or two. XLA
+    can't try kernels out there and takes its defaults, so that the count on a GPU may differ somewhat.
+    """
+    quiet()
+    import os
+
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_gpu_autotune_level=0"
+    from benchmarks import common
+    from benchmarks.train_step import configure
+
+    with refusing(ValueError):
+        config = configure(size, method, assignments)
+        compiled = compile_update(config, actions, target)
+    found = parts(compiled.as_text())
+    rows: list[Mapping[str, Any]] = [
+        {"part": part.name, "steps": part.steps, "kernels": sum(part.kernels.values()), "launches": part.launches}
+        for part in found
+    ]
+    total, memory = sum(part.launches for part in found), compiled.memory_analysis().temp_size_in_bytes
+    print(f"launches: an update of {method} at {size}, compiled for {target}\n")
+    print(common.table([*rows, {"part": "in all", "steps": None, "kernels": None, "launches": total}]))
+    print(f"\nof branches, of which one is taken, all are counted; temporary memory {memory / 1e9:.2f} GB")
+    settings = {"size": size, "method": method, "target": target, "set": list(assignments)}
+    line = {"benchmark": "launches", "settings": settings, "rows": rows, "launches": total, "temporary_bytes": memory}
+    print("\n" + json.dumps(line))
+
+
+def compile_update(config: Any, actions: int, target: str) -> Any:
+    """An update of the agent, compiled. Raises ValueError where the target's compiler is not installed."""
+    import jax
+    import jax.numpy as jnp
+
+    from ne_dreamer_jax.agents import make_agent
+    from ne_dreamer_jax.nets.platform import traced_for
+    from ne_dreamer_jax.replay import ring as replay
+    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
+
+    side = config.env.image_size
+    spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
+    place = jax.sharding.SingleDeviceSharding(_device(target))
+    placed = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree)
+    with traced_for(target):
+        agent = make_agent(config.agent, spec)
+        state = placed(jax.eval_shape(agent.init, jax.random.key(0)))
+        batch = placed(jax.eval_shape(lambda key: replay.random_batch(spec, config.agent, key), jax.random.key(1)))
+        jitted: Any = agent.train_step
+        return jitted.trace(state, batch).lower(lowering_platforms=(target,)).compile()
+
+
+def _device(target: str) -> Any:
+    import jax
+    from jax.experimental import topologies
+
+    if target == "cpu":
+        return jax.devices("cpu")[0]
+    try:
+        topology = topologies.get_topology_desc(platform=target, topology_name="", target_config=H100, topology="1x1x1")
+    except Exception as error:  # whatever the plugin raises
+        raise ValueError(
+            f"expected XLA's compiler for {target}, got {error}. Install it: pip install 'ne-dreamer-jax[cuda]'."
+        ) from error
+    return topology.devices[0]
+
+
+def parts(text: str) -> list[Part]:
+    """The parts of an optimised HLO program that launch anything, those that launch most first."""
+    computations, entry = _computations(text)
+    found = list(_walk(computations, entry, "outside of loops", 1))
+    return sorted((part for part in found if part.kernels), key=lambda part: -part.launches)
+
+
+def _computations(text: str) -> tuple[dict[str, list[str]], str]:
+    """Computation -> its instructions, each from its type on; and which is the program's entry."""
+    computations: dict[str, list[str]] = {}
+    entry, current = "", None
+    for line in text.splitlines():
+        if head := COMPUTATION.match(line):
+            current = head[2]
+            computations[current] = []
+            entry = current if head[1] else entry
+        elif line.startswith("}"):
+            current = None
+        elif current is not None and (instruction := INSTRUCTION.match(line)):
+            computations[current].append(instruction[1])
+    return computations, entry
+
+
+def _walk(computations: Mapping[str, list[str]], name: str, title: str, steps: int) -> Iterator[Part]:
+    """A computation, and those that its loops, conditionals and calls run."""
+    kernels: Counter[str] = Counter()
+    for instruction in computations[name]:
+        operation, operands = _operation(instruction)
+        if operation == "while":
+            count = re.search(r'known_trip_count":\{"n":"(\d+)"', operands)
+            inner = steps * (int(count[1]) if count else 1)
+            yield from _walk(computations, _reference("body", operands), f"loop: {_source(operands)}", inner)
+        elif operation == "conditional":
+            for i, branch in enumerate(_branches(operands)):
+                yield from _walk(computations, branch, f"branch {i}: {_source(operands)}", steps)
+        elif operation == "call":
+            yield from _walk(computations, _reference("to_apply", operands), title, steps)
+        elif operation not in FREE:
+            kernels[operation] += 1
+    yield Part(title, steps, kernels)
+
+
+def _operation(instruction: str) -> tuple[str, str]:
+    """An instruction's operation and what follows its name; its type, which may be a tuple of types, stands before."""
+    depth = 0
+    for i, character in enumerate(instruction):
+        depth += (character == "(") - (character == ")")
+        if depth == 0 and character == " ":
+            rest = instruction[i + 1 :]
+            operation = rest[: rest.index("(")]
+            return operation, rest[len(operation) :]
+    raise ValueError(f"expected an HLO instruction, got {instruction[:80]!r}")
+
+
+def _reference(attribute: str, operands: str) -> str:
+    found = re.search(rf"{attribute}=%?([\w.\-]+)", operands)
+    assert found is not None
+    return found[1]
+
+
+def _branches(operands: str) -> list[str]:
+    listed = re.search(r"branch_computations=\{([^}]*)\}", operands)
+    if listed:
+        return [name.strip().lstrip("%") for name in listed[1].split(",")]
+    return [_reference(f"{which}_computation", operands) for which in ("true", "false")]
+
+
+def _source(operands: str) -> str:
+    """Where in the program an instruction comes from."""
+    found = re.search(r'op_name="(?:jit\(\w+\)/)?([^"]*)"', operands)
+    return found[1] if found else "?"
+
+
+if __name__ == "__main__":
+    main()
