@@ -1,5 +1,7 @@
 """Strict numerics for every test: no silent dtype or rank promotion."""
 
+import gc
+
 import hypothesis
 import jax
 import pytest
@@ -19,3 +21,11 @@ def quick_compilation():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """A module's compiled programs are of no use to the next one, and all of them together take gigabytes."""
+    yield
+    jax.clear_caches()
+    gc.collect()

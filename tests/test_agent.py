@@ -156,6 +156,7 @@ def half(update):
     return make_agent(REPLACE(update.agent.config, compute_dtype="bfloat16"), tiny.BOTH)
 
 
+@pytest.mark.slow
 def test_bfloat16_products_change_the_losses_little(update, half):
     state, latents, metrics = half.train_step(tiny.state(half), update.batch)
     kinds = {x.dtype for x in jax.tree.leaves((state.params, state.optimizer, latents, metrics))}
@@ -314,11 +315,9 @@ def test_the_update_of_every_method_keeps_the_state_as_it_is_made(method, dtype)
     assert {f"loss/{name}" for name in config.loss_scales} <= set(metrics)
 
 
-OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in tiny.OBJECTIVES if name != "ne_dreamer"]
-
-
-@pytest.mark.parametrize("gradient", ["reinforce", pytest.param("dynamics", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("method", ["ne_dreamer", *OTHERS])
+@pytest.mark.slow
+@pytest.mark.parametrize("gradient", ["reinforce", "dynamics"])
+@pytest.mark.parametrize("method", tiny.OBJECTIVES)
 def test_an_update_in_microbatches_is_the_update(method, gradient):
     """Losses, latents and gradients: an optimiser whose steps are a tenth of the gradients, for small ones."""
     plain = OptimizerConfig(learning_rate=1.0, eps=10.0, agc=math.inf, warmup=0)

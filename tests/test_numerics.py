@@ -147,6 +147,7 @@ TOLD = {
 }
 
 
+@pytest.mark.slow
 def test_a_sound_run_stays_one_whatever_jax_is_told():
     environment = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", **TOLD}
     subprocess.run([sys.executable, "-c", CHUNK], env=environment, check=True, timeout=600)

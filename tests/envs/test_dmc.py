@@ -20,7 +20,7 @@ from ne_dreamer_jax.envs.dmc import simulation as stepping
 from ne_dreamer_jax.envs.dmc.simulation import mjx
 
 NAMES = [name for name in envs.names() if name.startswith("dmc/")]
-QUICK = ["dmc/pendulum_swingup", "dmc/cartpole_swingup"]  # domains that compile in seconds
+QUICK = ["dmc/pendulum_swingup"]  # compiles in seconds
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name not in QUICK]
 
 
@@ -262,9 +262,9 @@ def test_training_begins_with_the_models_own_data():
 
 
 def test_physics_that_stops_being_finite_ends_the_episode_and_the_next_is_sound():
-    ours = compiled("dmc/cartpole_swingup")
+    ours = compiled("dmc/pendulum_swingup")
     state, _ = ours.reset(jax.random.split(jax.random.key(0), 2))
-    broken = state.physics.replace(qvel=state.physics.qvel.at[0, 1].set(jnp.nan))
+    broken = state.physics.replace(qvel=state.physics.qvel.at[0, 0].set(jnp.nan))
     state, timestep = ours.step(state._replace(core=state.core._replace(physics=broken)), jnp.zeros((2, 1)))
     np.testing.assert_array_equal(timestep.is_last, [True, False])
     np.testing.assert_array_equal(timestep.is_terminal, [False, False])
@@ -280,7 +280,7 @@ def test_physics_that_stops_being_finite_ends_the_episode_and_the_next_is_sound(
 
 
 def test_env_state_gives_the_mjx_data():
-    ours = compiled("dmc/cartpole_swingup")
+    ours = compiled("dmc/pendulum_swingup")
     assert isinstance(ours.env.reset(jax.random.key(0))[0].physics, mjx.Data)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from ne_dreamer_jax.envs import conformance, dmc
 from ne_dreamer_jax.envs.dmc.simulation import STATE, start_of
+from tests.marks import slow_but
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -105,9 +106,12 @@ def assert_like(data, reference):
         np.testing.assert_allclose(getattr(data, field), expected, rtol=2e-4, atol=2e-4, err_msg=field)
 
 
-@pytest.mark.parametrize(("kind", "n_sub_steps"), list(zip(MODELS, (1, 3, 1, 2, 3), strict=True)))
-def test_steps_sensors_and_restarts_are_mujocos(kind, n_sub_steps):
-    model = MODELS[kind]()
+SUB_STEPS = dict(zip(MODELS, (1, 3, 1, 2, 3), strict=True))
+
+
+@pytest.mark.parametrize("kind", slow_but(MODELS, "RK4, sensors of acceleration", "contact"))
+def test_steps_sensors_and_restarts_are_mujocos(kind):
+    model, n_sub_steps = MODELS[kind](), SUB_STEPS[kind]
     simulation = dmc.Simulation.of(model, n_sub_steps * model.opt.timestep)
     assert simulation.n_sub_steps == n_sub_steps
     rng = np.random.default_rng(0)
@@ -271,7 +275,7 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize("kind", OWN)
+@pytest.mark.parametrize("kind", slow_but(OWN, next(iter(OWN))))
 def test_episodes_of_own_tasks_are_the_same_however_they_begin(kind):
     conformance.check(dmc.from_task(OWN[kind](), obs="vector"), jax.random.key(0))
 

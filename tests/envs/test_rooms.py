@@ -23,6 +23,7 @@ from ne_dreamer_jax.envs.rooms import (
     watermaze,
 )
 from ne_dreamer_jax.envs.rooms.game import make_core
+from tests.marks import slow_but
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -328,7 +329,10 @@ def scene_of(name, key=0):
     return game, body, task
 
 
-@pytest.mark.parametrize("name", ["rooms/collect_good_objects", "rooms/select_nonmatching_object", "rooms/watermaze"])
+PICTURES = ["rooms/collect_good_objects", "rooms/select_nonmatching_object", "rooms/watermaze"]
+
+
+@pytest.mark.parametrize("name", slow_but(PICTURES, "rooms/select_nonmatching_object"))
 def test_pictures_are_those_of_four_times_the_resolution(name):
     """What a pixel shows is about the mean of what 4 x 4 finer ones show."""
     worst, errors = [], []

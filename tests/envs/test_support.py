@@ -12,6 +12,7 @@ from ne_dreamer_jax.envs import dmc
 from ne_dreamer_jax.envs.dmc import names as dmc_names
 from ne_dreamer_jax.envs.dmc import support
 from ne_dreamer_jax.envs.dmc.simulation import start_of
+from tests.marks import slow_but
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -341,7 +342,9 @@ ALIKE = {
 }
 
 
-@pytest.mark.parametrize("kind", ALIKE)
+@pytest.mark.parametrize(
+    "kind", slow_but(ALIKE, "joints, tendons, actuators", "contacts", "routes and couplings", "sensors")
+)
 def test_what_is_not_refused_is_simulated_as_mujoco_does(kind):
     reference = assert_like_mujoco(pendulum(**ALIKE[kind]))
     if "contacts" in kind:

@@ -138,6 +138,7 @@ def endless() -> base.Env:
     return base.from_core(base.Core(spec, reset, base.restart_or_step(reset, step), observe))
 
 
+@pytest.mark.slow
 def test_an_environment_that_never_ends_is_evaluated_up_to_the_bound(tmp_path):
     said = []
     outcome = nedreamer.train(toy.config(eval_max_steps=100), tmp_path / "run", env=endless(), echo=said.append)
