@@ -298,3 +298,20 @@ def test_imagined_latents_are_samples_of_the_prior():
     probs = 0.99 * probs / probs.sum(-1, keepdims=True) + 0.01 / 4
     for s in range(4):
         assert stats.chisquare(np.asarray(latent.stoch[:, s]).sum(0), 4_000 * probs[s]).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("last", [2, 3, T, T + 1])
+def test_behaviour_of_the_last_steps_is_that_of_a_rollout_cut_to_them(last):
+    model, kept = make(tiny.VECTORS, CONFIG), min(last, T)
+    rollout, _ = world_model.posterior_rollout(model.nets, model.params, jax.random.key(0), model.batch)
+    short = jax.tree.map(lambda x: x[:, T - kept :], rollout._replace(batch=rollout.batch._replace(context=None)))
+
+    def losses(config, rollout):
+        return jax.jit(
+            lambda params: behavior.actor_critic_losses(model.nets, config, params, model.slow, OLD_SCALE, KEY, rollout)
+        )(model.params)
+
+    got, want = losses(replace(CONFIG, imagine_last=last), rollout), losses(CONFIG, short)
+    jax.tree.map(np.testing.assert_array_equal, got, want)
+    if kept < T:
+        assert float(got[0]["critic"]) != float(losses(CONFIG, rollout)[0]["critic"])

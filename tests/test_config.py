@@ -292,6 +292,7 @@ CHANGES = {
     },
     "agent.behavior": {
         "horizon": "2",
+        "imagine_last": "3",
         "discount": "0.85",
         "discount_in_head": "false",
         "lam": "0.9",

@@ -28,7 +28,7 @@ from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rssm import RSSM, feature
 from ne_dreamer_jax.settings import ranges
-from ne_dreamer_jax.settings.ranges import NonNegative, Positive, Range, Share, ShareBelowOne
+from ne_dreamer_jax.settings.ranges import LARGEST, NonNegative, Positive, Range, Share, ShareBelowOne
 from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
 
 LOSSES = ("actor", "critic", "replay_critic")
@@ -43,6 +43,9 @@ class BehaviorConfig:
 
     horizon: Annotated[int, Range(1, 10_000)] = 15
     """H, imagined steps."""
+    imagine_last: Annotated[int, Range(2, LARGEST)] | None = None
+    """Of how many states, the last ones of each replayed sequence, behaviour is learned: they begin the imagined
+    trajectories, and the critic learns from replay there (imag_last in DreamerV3's code). None: of all T."""
     discount: ShareBelowOne = 0.997
     """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
     discount_in_head: bool = True
@@ -183,6 +186,7 @@ def actor_critic_losses(
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
+    All are of the last ``config.imagine_last`` steps of the rollout.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
     their returns are those of all.
@@ -206,6 +210,7 @@ def actor_critic_losses(
             policy=apply("actor", params, fixed) if through_model else None,
         )
 
+    rollout = _last_steps(rollout, config.imagine_last)
     acting = {**frozen, "actor": params["actor"]}
     start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
     noise = imagination_noise(nets, key, start.deter.shape[0], config.horizon)
@@ -251,10 +256,23 @@ def actor_critic_losses(
     return losses, scale, jax.lax.stop_gradient(metrics)
 
 
+def _last_steps(rollout: Rollout, steps: int | None) -> Rollout:
+    """The rollout's last steps; its batch's context is what it was. All of them where ``steps`` is none or over T."""
+    if steps is None:
+        return rollout
+    cut = lambda tree: jax.tree.map(lambda x: x[:, -steps:], tree)
+    return cut(rollout._replace(batch=None))._replace(  # type: ignore[arg-type]
+        batch=cut(rollout.batch._replace(context=None))._replace(context=rollout.batch.context)  # type: ignore[arg-type]
+    )
+
+
 def _replay_critic_loss(
     nets: Networks, config: BehaviorConfig, params: Params, slow_value, rollout: Rollout, imagined_return: Array
 ) -> Array:
-    """Critic loss [B, T - 1] on replayed rewards, bootstrapped by the imagined return from each state [B*T]."""
+    """Critic loss [B, T - 1] on replayed rewards, bootstrapped by the imagined return from each state [B*T].
+
+    T is that of the rollout, which may have been cut to its last steps.
+    """
     batch = rollout.batch
     bootstrap = jax.lax.stop_gradient(imagined_return).reshape(batch.reward.shape)
     discount = config.discount * (1 - batch.is_terminal.astype(jnp.float32))
