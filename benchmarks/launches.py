@@ -1,7 +1,7 @@
-"""Counts the kernels of an update, for a GPU that need not be there: ``python -m benchmarks.launches --help``.
+"""Counts the kernels of a program, for a GPU that need not be there: ``python -m benchmarks.launches --help``.
 
-Where kernels are short, what decides on a GPU is how many are launched. The update is compiled ahead of time, and the
-optimised program is read: every instruction of it that computes or copies is a kernel, and those in a loop's body count
+Where kernels are short, what decides on a GPU is how many are launched. The program is compiled ahead of time, and what
+the compiler made of it is read: every instruction that computes or copies is a kernel, and those in a loop's body count
 once for each of its steps.
 """
 
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from ne_dreamer_jax.commands.options import Name, refusing
+from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.quiet import quiet
 
@@ -48,7 +48,7 @@ class Part(NamedTuple):
     """The program outside of loops, a loop's body, or a branch of a conditional."""
 
     name: str
-    steps: int  # how often it runs in an update; 1 where the program does not say
+    steps: int  # how often it runs; 1 where the program does not say
     kernels: Counter[str]  # kind -> launches in one of its steps
 
     @property
@@ -62,9 +62,10 @@ class Part(NamedTuple):
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
 @click.option("--target", type=Name("target", TARGETS), default="cuda", show_default=True)
 @click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
+@click.option("--task", type=Task(), help="Count the step of 16 environments with their pictures, not an update.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
-def main(size: str, method: str, target: str, actions: int, assignments: tuple[str, ...]) -> None:
-    """Count the kernels of an update on 64x64x3 frames (drqv2: 84x84x3), by loop.
+def main(size: str, method: str, target: str, actions: int, task: str | None, assignments: tuple[str, ...]) -> None:
+    """Count the kernels of an update on 64x64x3 frames (drqv2: 84x84x3), by loop; or of an environment's step.
 
     --target cuda compiles for an H100, without one; it needs the packages of the extra `cuda` and a minute or two. XLA
     can't try kernels out there and takes its defaults, so that the count on a GPU may differ somewhat.
@@ -78,18 +79,19 @@ def main(size: str, method: str, target: str, actions: int, assignments: tuple[s
     from benchmarks.train_step import configure
 
     with refusing(ValueError):
-        config = configure(size, method, assignments)
-        compiled = compile_update(config, actions, target)
+        config = configure(size, method, (*assignments, *([f"env.task={task}"] if task else [])))
+        compiled = compile_step(config, target) if task else compile_update(config, actions, target)
     found = parts(compiled.as_text())
     rows: list[Mapping[str, Any]] = [
         {"part": part.name, "steps": part.steps, "kernels": sum(part.kernels.values()), "launches": part.launches}
         for part in found
     ]
     total, memory = sum(part.launches for part in found), compiled.memory_analysis().temp_size_in_bytes
-    print(f"launches: an update of {method} at {size}, compiled for {target}\n")
+    what = f"a step of {config.loop.num_envs} {task}" if task else f"an update of {method} at {size}"
+    print(f"launches: {what}, compiled for {target}\n")
     print(common.table([*rows, {"part": "in all", "steps": None, "kernels": None, "launches": total}]))
     print(f"\nof branches, of which one is taken, all are counted; temporary memory {memory / 1e9:.2f} GB")
-    settings = {"size": size, "method": method, "target": target, "set": list(assignments)}
+    settings = {"what": what, "target": target, "set": list(assignments)}
     line = {"benchmark": "launches", "settings": settings, "rows": rows, "launches": total, "temporary_bytes": memory}
     print("\n" + json.dumps(line))
 
@@ -106,14 +108,34 @@ def compile_update(config: Any, actions: int, target: str) -> Any:
 
     side = config.env.image_size
     spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
-    place = jax.sharding.SingleDeviceSharding(_device(target))
-    placed = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree)
     with traced_for(target):
         agent = make_agent(config.agent, spec)
-        state = placed(jax.eval_shape(agent.init, jax.random.key(0)))
-        batch = placed(jax.eval_shape(lambda key: replay.random_batch(spec, config.agent, key), jax.random.key(1)))
-        jitted: Any = agent.train_step
-        return jitted.trace(state, batch).lower(lowering_platforms=(target,)).compile()
+        state = jax.eval_shape(agent.init, jax.random.key(0))
+        batch = jax.eval_shape(lambda key: replay.random_batch(spec, config.agent, key), jax.random.key(1))
+        return _compile(agent.train_step, (state, batch), target)
+
+
+def compile_step(config: Any, target: str) -> Any:
+    """A step of the environments, with their pictures, compiled. Raises ValueError as `compile_update`."""
+    import jax
+    import jax.numpy as jnp
+
+    from ne_dreamer_jax.envs import config as env_configs
+    from ne_dreamer_jax.nets.platform import traced_for
+
+    env, n = env_configs.make(config.env), config.loop.num_envs
+    with traced_for(target):
+        state = jax.eval_shape(jax.vmap(env.prepare), jax.random.split(jax.random.key(0), n))
+        action = jax.ShapeDtypeStruct((n, *env.spec.action.shape), jnp.dtype(env.spec.action.dtype))
+        return _compile(jax.jit(jax.vmap(env.step)), (state, action), target)
+
+
+def _compile(function: Any, inputs: Any, target: str) -> Any:
+    import jax
+
+    place = jax.sharding.SingleDeviceSharding(_device(target))
+    placed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), inputs)
+    return function.trace(*placed).lower(lowering_platforms=(target,)).compile()
 
 
 def _device(target: str) -> Any:
