@@ -81,7 +81,6 @@ STAGES = (
         ("--size", "1m", "--rounds", "1", *_set(*TINY)), 120,
     ),
     Stage("memory", "memory", ("--no-compile",), ("--no-compile", "--size", "1m"), 20),
-    Stage("launches", "launches", (), ("--target", "cpu", "--size", "1m", *_set(*TINY)), 60),
 )  # fmt: skip
 
 

@@ -1,13 +1,15 @@
 """Counts the kernels of a program, for a GPU that need not be there: ``python -m benchmarks.launches --help``.
 
 Where kernels are short, what decides on a GPU is how many are launched. The program is compiled ahead of time, and what
-the compiler made of it is read: every instruction that computes or copies is a kernel, and those in a loop's body count
-once for each of its steps.
+the compiler made of it is read: every instruction that computes or copies is counted as one kernel, and those in a
+loop's body once for each of its steps. A library's call may be several kernels, and the conditions of loops, which some
+of them evaluate on the host, are not counted.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -22,6 +24,8 @@ from ne_dreamer_jax.system.quiet import quiet
 TARGETS = ("cuda", "cpu")
 FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all", "opt-barrier"}
 """Instructions that launch nothing."""
+ENDS = ("-done", "-update")
+"""Of instructions that wait for what another one has launched."""
 COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.\-]+) \(.*\) -> .* \{$")
 INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?[\w.\-]+ = (.*)$")
 
@@ -48,7 +52,8 @@ class Part(NamedTuple):
     """The program outside of loops, a loop's body, or a branch of a conditional."""
 
     name: str
-    steps: int  # how often it runs; 1 where the program does not say
+    steps: int  # how often it runs
+    certain: bool  # whether the program says so; a loop that ends by its values counts as one step
     kernels: Counter[str]  # kind -> launches in one of its steps
 
     @property
@@ -62,7 +67,7 @@ class Part(NamedTuple):
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
 @click.option("--target", type=Name("target", TARGETS), default="cuda", show_default=True)
 @click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
-@click.option("--task", type=Task(), help="Count the step of 16 environments with their pictures, not an update.")
+@click.option("--task", type=Task(), help="Count a step of its environments, whatever the agent.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
 def main(size: str, method: str, target: str, actions: int, task: str | None, assignments: tuple[str, ...]) -> None:
     """Count the kernels of an update on 64x64x3 frames (drqv2: 84x84x3), by loop; or of an environment's step.
@@ -71,8 +76,6 @@ def main(size: str, method: str, target: str, actions: int, task: str | None, as
     can't try kernels out there and takes its defaults, so that the count on a GPU may differ somewhat.
     """
     quiet()
-    import os
-
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_gpu_autotune_level=0"
     from benchmarks import common
@@ -83,17 +86,24 @@ def main(size: str, method: str, target: str, actions: int, task: str | None, as
         compiled = compile_step(config, target) if task else compile_update(config, actions, target)
     found = parts(compiled.as_text())
     rows: list[Mapping[str, Any]] = [
-        {"part": part.name, "steps": part.steps, "kernels": sum(part.kernels.values()), "launches": part.launches}
+        {
+            "part": part.name,
+            "steps": f"{part.steps}" if part.certain else f"{part.steps} or more",
+            "kernels": sum(part.kernels.values()),
+            "launches": part.launches,
+        }
         for part in found
     ]
     total, memory = sum(part.launches for part in found), compiled.memory_analysis().temp_size_in_bytes
     what = f"a step of {config.loop.num_envs} {task}" if task else f"an update of {method} at {size}"
     print(f"launches: {what}, compiled for {target}\n")
     print(common.table([*rows, {"part": "in all", "steps": None, "kernels": None, "launches": total}]))
-    print(f"\nof branches, of which one is taken, all are counted; temporary memory {memory / 1e9:.2f} GB")
-    settings = {"what": what, "target": target, "set": list(assignments)}
-    line = {"benchmark": "launches", "settings": settings, "rows": rows, "launches": total, "temporary_bytes": memory}
-    print("\n" + json.dumps(line))
+    print("\nall branches of a conditional are counted, of which one is taken;", end=" ")
+    print("where the program does not say how many steps a loop takes, one step is counted")
+    print(f"temporary memory {memory / 1e9:.2f} GB")
+    settings = {"size": size, "method": method, "task": task, "target": target, "set": list(assignments)}
+    line = {"benchmark": "launches", "machine": common.machine(), "settings": settings, "rows": rows}
+    print("\n" + json.dumps({**line, "launches": total, "temporary_bytes": memory}))
 
 
 def compile_update(config: Any, actions: int, target: str) -> Any:
@@ -148,7 +158,7 @@ def _device(target: str) -> Any:
         topology = topologies.get_topology_desc(platform=target, topology_name="", target_config=H100, topology="1x1x1")
     except Exception as error:  # whatever the plugin raises
         raise ValueError(
-            f"expected XLA's compiler for {target}, got {error}. Install it: pip install 'ne-dreamer-jax[cuda]'."
+            f"expected XLA's compiler for {target} (pip install 'ne-dreamer-jax[cuda]'), got {error}"
         ) from error
     return topology.devices[0]
 
@@ -156,7 +166,7 @@ def _device(target: str) -> Any:
 def parts(text: str) -> list[Part]:
     """The parts of an optimised HLO program that launch anything, those that launch most first."""
     computations, entry = _computations(text)
-    found = list(_walk(computations, entry, "outside of loops", 1))
+    found = list(_walk(computations, entry, Part("outside of loops", 1, True, Counter())))
     return sorted((part for part in found if part.kernels), key=lambda part: -part.launches)
 
 
@@ -176,23 +186,26 @@ def _computations(text: str) -> tuple[dict[str, list[str]], str]:
     return computations, entry
 
 
-def _walk(computations: Mapping[str, list[str]], name: str, title: str, steps: int) -> Iterator[Part]:
-    """A computation, and those that its loops, conditionals and calls run."""
-    kernels: Counter[str] = Counter()
+def _walk(computations: Mapping[str, list[str]], name: str, part: Part) -> Iterator[Part]:
+    """A part of the program with a computation's kernels added, and those that its loops and conditionals run."""
     for instruction in computations[name]:
         operation, operands = _operation(instruction)
         if operation == "while":
             count = re.search(r'known_trip_count":\{"n":"(\d+)"', operands)
-            inner = steps * (int(count[1]) if count else 1)
-            yield from _walk(computations, _reference("body", operands), f"loop: {_source(operands)}", inner)
+            steps, certain = part.steps * (int(count[1]) if count else 1), part.certain and count is not None
+            body = Part(f"loop: {_source(operands)}", steps, certain, Counter())
+            yield from _walk(computations, _reference("body", operands), body)
         elif operation == "conditional":
             for i, branch in enumerate(_branches(operands)):
-                yield from _walk(computations, branch, f"branch {i}: {_source(operands)}", steps)
+                taken = part._replace(name=f"branch {i}: {_source(operands)}", kernels=Counter())
+                yield from _walk(computations, branch, taken)
         elif operation == "call":
-            yield from _walk(computations, _reference("to_apply", operands), title, steps)
-        elif operation not in FREE:
-            kernels[operation] += 1
-    yield Part(title, steps, kernels)
+            *inner, called = _walk(computations, _reference("to_apply", operands), part._replace(kernels=Counter()))
+            yield from inner
+            part.kernels.update(called.kernels)
+        elif operation not in FREE and not operation.endswith(ENDS):
+            part.kernels[operation] += 1
+    yield part
 
 
 def _operation(instruction: str) -> tuple[str, str]:

@@ -18,6 +18,7 @@ from ne_dreamer_jax.replay import ring as replay
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, TimeStep
 from tests import tiny
+from tests.marks import slow_but
 from tests.tiny import assert_same
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -156,7 +157,6 @@ def half(update):
     return make_agent(REPLACE(update.agent.config, compute_dtype="bfloat16"), tiny.BOTH)
 
 
-@pytest.mark.slow
 def test_bfloat16_products_change_the_losses_little(update, half):
     state, latents, metrics = half.train_step(tiny.state(half), update.batch)
     kinds = {x.dtype for x in jax.tree.leaves((state.params, state.optimizer, latents, metrics))}
@@ -315,14 +315,18 @@ def test_the_update_of_every_method_keeps_the_state_as_it_is_made(method, dtype)
     assert {f"loss/{name}" for name in config.loss_scales} <= set(metrics)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gradient", ["reinforce", "dynamics"])
-@pytest.mark.parametrize("method", tiny.OBJECTIVES)
-def test_an_update_in_microbatches_is_the_update(method, gradient):
+QUICK = ("dreamer_no_reconstruction", "reinforce", 3)
+CASES = [(method, gradient, None) for method in tiny.OBJECTIVES for gradient in ("reinforce", "dynamics")]
+CASES += [QUICK, ("ne_dreamer", "dynamics", 3)]
+
+
+@pytest.mark.parametrize("case", slow_but(CASES, QUICK), ids=str)
+def test_an_update_in_microbatches_is_the_update(case):
     """Losses, latents and gradients: an optimiser whose steps are a tenth of the gradients, for small ones."""
+    method, gradient, last = case
     plain = OptimizerConfig(learning_rate=1.0, eps=10.0, agc=math.inf, warmup=0)
     config = REPLACE(tiny.with_method(tiny.OBJECTIVES[method]), optimizer=plain, batch_size=4)
-    config = REPLACE(config, behavior=REPLACE(config.behavior, gradient=gradient))
+    config = REPLACE(config, behavior=REPLACE(config.behavior, gradient=gradient, imagine_last=last))
     batch = tiny.batch(tiny.BOTH, (4, 5))
 
     def updated(count):
@@ -330,6 +334,7 @@ def test_an_update_in_microbatches_is_the_update(method, gradient):
         state = tiny.state(agent)
         before = jax.tree.map(np.asarray, state.params)
         state, latents, metrics = agent.train_step(state, batch)
+        assert latents.deter.shape[:2] == (4, 5)
         return jax.tree.map(lambda a, b: 10 * (np.asarray(a) - b), state.params, before), latents, metrics
 
     want = updated(1)

@@ -300,7 +300,7 @@ def test_imagined_latents_are_samples_of_the_prior():
         assert stats.chisquare(np.asarray(latent.stoch[:, s]).sum(0), 4_000 * probs[s]).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("last", [2, 3, T, T + 1])
+@pytest.mark.parametrize("last", [2, T + 1])
 def test_behaviour_of_the_last_steps_is_that_of_a_rollout_cut_to_them(last):
     model, kept = make(tiny.VECTORS, CONFIG), min(last, T)
     rollout, _ = world_model.posterior_rollout(model.nets, model.params, jax.random.key(0), model.batch)
@@ -312,6 +312,15 @@ def test_behaviour_of_the_last_steps_is_that_of_a_rollout_cut_to_them(last):
         )(model.params)
 
     got, want = losses(replace(CONFIG, imagine_last=last), rollout), losses(CONFIG, short)
-    jax.tree.map(np.testing.assert_array_equal, got, want)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-7), got, want)
     if kept < T:
-        assert float(got[0]["critic"]) != float(losses(CONFIG, rollout)[0]["critic"])
+        assert float(got[0]["critic"]) != pytest.approx(float(losses(CONFIG, rollout)[0]["critic"]), rel=1e-3)
+
+
+def test_the_last_steps_are_the_newest():
+    rollout, _ = world_model.posterior_rollout(
+        tiny.networks(tiny.VECTORS), tiny.params(tiny.networks(tiny.VECTORS)), KEY, tiny.batch(tiny.VECTORS)
+    )
+    two = behavior.Replayed.of(rollout, 2)
+    np.testing.assert_array_equal(two.latent.deter, rollout.latent.deter[:, [T - 2, T - 1]])
+    np.testing.assert_array_equal(two.reward, rollout.batch.reward[:, [T - 2, T - 1]])

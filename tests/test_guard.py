@@ -16,6 +16,7 @@ from ne_dreamer_jax.runs.record import Record
 from tests import tiny
 from tests.drqv2 import small
 from tests.experiments import stub, toy
+from tests.marks import slow_but
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -108,8 +109,7 @@ def test_large_negative_and_constant_rewards_are_learned_from(tmp_path, reward):
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(loaded.state.params))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("length", [1, 2])
+@pytest.mark.parametrize("length", slow_but([1, 2], 1))
 def test_episodes_of_one_and_two_steps_are_learned_from(tmp_path, length):
     def reset(key):
         return jax.random.normal(key), jnp.zeros((), jnp.int32)

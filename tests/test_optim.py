@@ -170,3 +170,14 @@ def test_update_without_parameters_is_refused():
     optimizer = make(OptimizerConfig())
     with pytest.raises(ValueError, match="params"):
         optimizer.update(jnp.ones(3), optimizer.init(jnp.ones(3)))
+
+
+def test_clipping_takes_trees_of_any_dtype_and_none_at_all():
+    transform = clip_per_tensor(0.3, 1e-3)
+    params = {"half": jnp.ones((2, 2), jnp.bfloat16), "whole": jnp.ones(())}
+    gradients = {"half": jnp.full((2, 2), 4.0, jnp.bfloat16), "whole": jnp.full((), 0.1)}
+    got, _ = transform.update(gradients, transform.init(params), params)
+    assert got["half"].dtype == jnp.bfloat16
+    np.testing.assert_allclose(got["half"].astype(jnp.float32), 0.3, rtol=1e-2)
+    np.testing.assert_allclose(got["whole"], 0.1, rtol=1e-6)
+    assert transform.update({}, transform.init({}), {})[0] == {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -60,19 +60,31 @@ def clip_per_tensor(
         if params is None:
             raise ValueError("clipping relative to the parameters needs them: call update(gradients, state, params)")
         leaves, structure = jax.tree.flatten_with_path(updates)
-        tensors: dict[Hashable, list[tuple[jax.Array, jax.Array]]] = {}
+        if not leaves:
+            return updates, state
+        gradients: dict[Hashable, list[jax.Array]] = {}
+        parameters: dict[Hashable, list[jax.Array]] = {}
         for (path, gradient), parameter in zip(leaves, jax.tree.leaves(params), strict=True):
-            tensors.setdefault(tensor(path), []).append((gradient, parameter))
-        # All norms in one array, so that what follows is a few kernels in all and not a few for each tensor.
-        both = [list(zip(*parts, strict=True)) for parts in tensors.values()]  # gradients and parameters
-        squares = [optax.tree.norm(pair[i], squared=True) for i in (0, 1) for pair in both]
-        of_gradients, of_parameters = jnp.sqrt(jnp.stack(squares)).reshape(2, -1)
-        divisors = jnp.maximum(of_gradients / (clip * jnp.maximum(of_parameters, pmin)), 1.0)
-        of_tensor = dict(zip(tensors, jnp.split(divisors, len(tensors)), strict=True))
-        clipped = [gradient / of_tensor[tensor(path)].reshape((1,) * gradient.ndim) for path, gradient in leaves]
+            gradients.setdefault(tensor(path), []).append(gradient)
+            parameters.setdefault(tensor(path), []).append(parameter)
+        limit = clip * jnp.maximum(_norms(parameters), pmin)
+        divisor = jnp.maximum(_norms(gradients) / limit, 1.0)
+        of_tensor = dict(zip(gradients, jnp.split(divisor, len(gradients)), strict=True))
+        clipped = [
+            gradient / of_tensor[tensor(path)].reshape((1,) * gradient.ndim).astype(gradient.dtype)
+            for path, gradient in leaves
+        ]
         return jax.tree.unflatten(structure, clipped), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
+
+
+def _norms(tensors: Mapping[Hashable, Sequence[jax.Array]]) -> jax.Array:
+    """The norm of each tensor, float32 [n].
+
+    One array, so that what is done with the norms is a few kernels in all and not a few for each of them.
+    """
+    return jnp.sqrt(jnp.stack([optax.tree.norm(x, squared=True).astype(jnp.float32) for x in tensors.values()]))
 
 
 def whole_tensor(path: Path) -> Path:
@@ -119,8 +131,8 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
     min(1, (u + 1) / warmup); in LaProp's own code a normalised gradient counts in m by the learning rate of its update,
     which is another average while that rises (``laprop_weighted``).
 
-    With the default epsilon only gradients that are exactly zero, or whose squares underflow in float32 (below about
-    1e-18), feel it; zero gradients give zero updates.
+    With the default epsilon only gradients that are exactly zero, or whose squares' average underflows in float32
+    (below 3e-18), feel it; zero gradients give zero updates.
     """
     b1, b2, eps = config.beta1, config.beta2, config.eps
 

@@ -16,6 +16,7 @@ from flax.linen import initializers
 
 from ne_dreamer_jax.losses import unimix_logits
 from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init, per_block
+from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, Share, Width
 from ne_dreamer_jax.types import Array, Latent
@@ -211,8 +212,5 @@ def observe(
         return latent, (latent, logits)
 
     inputs = jax.tree.map(time_major, (observation_in, action_in, is_first, uniform))
-    # Only products are kept for the gradient: each array that is kept is stored by itself in every step, which on an
-    # accelerator costs more than to compute it again.
-    keep_products = jax.checkpoint(step, policy=jax.checkpoint_policies.dots_saveable, prevent_cse=False)
-    _, outputs = jax.lax.scan(keep_products, context, inputs)
+    _, outputs = jax.lax.scan(keeping_products(step), context, inputs)
     return jax.tree.map(time_major, outputs)

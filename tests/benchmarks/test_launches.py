@@ -56,7 +56,22 @@ backend_config={"known_trip_count":{"n":"5"}}
 
 def test_a_programs_text_is_read():
     loop, outside = launches.parts(TEXT)
-    assert (loop.name, loop.steps, dict(loop.kernels), loop.launches) == (
-        "loop: here/while", 5, {"fusion": 1, "copy": 1}, 10,
-    )  # fmt: skip
+    assert (loop.name, loop.steps, loop.certain) == ("loop: here/while", 5, True)
+    assert (dict(loop.kernels), loop.launches) == ({"fusion": 1, "copy": 1}, 10)
     assert (outside.steps, dict(outside.kernels)) == (1, {"custom-call": 1})
+
+
+def test_of_a_loop_that_ends_by_its_values_one_step_is_counted():
+    def program(x):
+        return jax.lax.while_loop(lambda x: x.sum() < 100, lambda x: jnp.sort(jnp.sin(x @ x)) + 2, x)
+
+    assert [part.certain for part in launches.parts(hlo(program, jnp.ones((16, 16)))) if "sort" in part.kernels] == [
+        False
+    ]
+
+
+def test_what_is_begun_and_waited_for_is_one_launch():
+    text = TEXT.replace(
+        "%copy = f32[4]{0} copy(%sin)", "%copy = f32[4]{0} copy-start(%sin)\n  %d = f32[4]{0} copy-done(%copy)"
+    )
+    assert launches.parts(text)[0].launches == 10

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ne_dreamer_jax.nets.platform import traced_for
 from ne_dreamer_jax.nets.rssm import RSSM, RSSMConfig, feature, initial_latent, mask_first, observe, sample_onehot
 from ne_dreamer_jax.types import Latent
 from tests import tiny
@@ -232,3 +233,27 @@ def test_bfloat16_products_keep_float32_latents():
     out = jax.eval_shape(run, shapes["params"])
     assert {x.dtype for x in jax.tree.leaves((shapes, out))} == {jnp.dtype(jnp.float32)}
     assert isinstance(out[0], Latent)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda"])
+def test_of_each_observed_step_products_are_kept_for_the_gradient(platform):
+    """Beside what a step returns; the blocks' products are several on a CPU and one elsewhere."""
+    nets = tiny.networks(tiny.VECTORS)
+    params = tiny.params(nets)["rssm"]
+    uniform = jnp.full((2, 5, nets.rssm.config.stoch), 0.5)
+    embedding, action = jnp.ones((2, 5, nets.embedding)), jnp.ones((2, 5, 2))
+    first = jnp.zeros((2, 5), bool)
+
+    def loss(params):
+        latent, logits = observe(nets.rssm, params, uniform, tiny.latent((2,)), embedding, action, first)
+        return jnp.sum(latent.deter) + jnp.sum(logits**2)
+
+    with traced_for(platform):
+        program = jax.make_jaxpr(jax.grad(loss))(params)
+    scans = [equation for equation in program.eqns if equation.primitive.name == "scan"]
+    (forward,) = [scan for scan in scans if not scan.params["reverse"]]
+    returned = len(jax.tree.leaves((tiny.latent((2,)), 0)))  # and the carry is kept besides
+    kept = len(forward.outvars) - forward.params["num_carry"] - returned
+    blocks = nets.rssm.config.blocks if platform == "cpu" else 1
+    products = 5 + 2 * blocks
+    assert 0 < kept <= products + 3, [str(x.aval) for x in forward.outvars]

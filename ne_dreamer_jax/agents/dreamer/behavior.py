@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -26,6 +27,7 @@ from ne_dreamer_jax.losses import (
 from ne_dreamer_jax.nets.heads import model_action, policy, policy_noise
 from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
+from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.nets.rssm import RSSM, feature
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import LARGEST, NonNegative, Positive, Range, Share, ShareBelowOne
@@ -44,8 +46,8 @@ class BehaviorConfig:
     horizon: Annotated[int, Range(1, 10_000)] = 15
     """H, imagined steps."""
     imagine_last: Annotated[int, Range(2, LARGEST)] | None = None
-    """Of how many states, the last ones of each replayed sequence, behaviour is learned: they begin the imagined
-    trajectories, and the critic learns from replay there (imag_last in DreamerV3's code). None: of all T."""
+    """Behaviour is learned at this many last states of each replayed sequence (imag_last in DreamerV3's code):
+    imagination starts there, and the critic learns from replay there. None: at all T, and so for more than T."""
     discount: ShareBelowOne = 0.997
     """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
     discount_in_head: bool = True
@@ -124,7 +126,7 @@ def imagine(
 
     def step(latent: Latent, noise: Noise) -> tuple[Latent, tuple[Any, Array, Array]]:
         state = feature(latent)
-        outputs = keep_products(nets.apply)("actor", params, state)
+        outputs = keeping_products(partial(nets.apply, "actor"))({"actor": params["actor"]}, state)
         raw = policy(nets.heads, nets.spec.action, outputs).from_noise(noise.action)
         raw = raw if through_model else jax.lax.stop_gradient(raw)
         action = model_action(nets.spec.action, raw, nets.heads.clip_actions)
@@ -147,20 +149,6 @@ def expected_discount(config: BehaviorConfig, logits: Array) -> Array:
 def head_discount(config: BehaviorConfig) -> float:
     """What the continuation head is trained towards where the episode goes on."""
     return config.discount if config.discount_in_head else 1.0
-
-
-def keep_products(apply: Callable[..., Any]) -> Callable[..., Any]:
-    """`Networks.apply` for a scan, of which matrix products alone are kept for the gradient.
-
-    What lies between them is computed again: less work than to write it for every step and to read it back. (Outside a
-    scan the compiler may keep more.)
-    """
-
-    def call(name: str, params: Params, x: Array) -> Array:
-        head = lambda params, x: apply(name, {name: params}, x)
-        return jax.checkpoint(head, policy=jax.checkpoint_policies.dots_saveable, prevent_cse=False)(params[name], x)
-
-    return call
 
 
 class Judgement(NamedTuple):
@@ -186,7 +174,7 @@ def actor_critic_losses(
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
-    All are of the last ``config.imagine_last`` steps of the rollout.
+    All of them, the return scale and the metrics are of the rollout's last ``config.imagine_last`` steps, or of all.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
     their returns are those of all.
@@ -197,7 +185,7 @@ def actor_critic_losses(
     slow_value = lambda x: twohot_mean(nets.apply("critic", {"critic": slow_critic}, x), bins)
 
     def judge(state: Array) -> Judgement:
-        apply = keep_products(nets.apply)
+        apply = lambda name, params, x: keeping_products(partial(nets.apply, name))({name: params[name]}, x)
         fixed = jax.lax.stop_gradient(state)
         logits = apply("critic", params, fixed)
         seen = state if through_model else fixed
@@ -210,9 +198,9 @@ def actor_critic_losses(
             policy=apply("actor", params, fixed) if through_model else None,
         )
 
-    rollout = _last_steps(rollout, config.imagine_last)
     acting = {**frozen, "actor": params["actor"]}
-    start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent))
+    replayed = Replayed.of(rollout, config.imagine_last)
+    start = jax.lax.stop_gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), replayed.latent))
     noise = imagination_noise(nets, key, start.deter.shape[0], config.horizon)
     dream = lambda start, noise: imagine(nets, acting, noise, start, judge, through_model)
     imagined = in_microbatches(dream, microbatches, (0, 1), Trajectory(1, 0, 1, 1))(start, noise)  # type: ignore[arg-type]
@@ -244,7 +232,7 @@ def actor_critic_losses(
         actor = reinforce_loss(log_prob, advantage, entropy, weight, config.entropy)
 
     critic = critic_loss(seen.logits, returns.T, seen.slow_value, weight.T, bins, config.slow_scale)  # [H, M]
-    replay_critic = _replay_critic_loss(nets, config, params, slow_value, rollout, returns[:, 0])
+    replay_critic = _replay_critic_loss(nets, config, params, slow_value, replayed, returns[:, 0])
     losses = {"actor": jnp.mean(actor), "critic": jnp.mean(critic), "replay_critic": jnp.mean(replay_critic)}
     metrics = {
         "imagined/return": jnp.mean(returns),
@@ -256,30 +244,33 @@ def actor_critic_losses(
     return losses, scale, jax.lax.stop_gradient(metrics)
 
 
-def _last_steps(rollout: Rollout, steps: int | None) -> Rollout:
-    """The rollout's last steps; its batch's context is what it was. All of them where ``steps`` is none or over T."""
-    if steps is None:
-        return rollout
-    cut = lambda tree: jax.tree.map(lambda x: x[:, -steps:], tree)
-    return cut(rollout._replace(batch=None))._replace(  # type: ignore[arg-type]
-        batch=cut(rollout.batch._replace(context=None))._replace(context=rollout.batch.context)  # type: ignore[arg-type]
-    )
+class Replayed(NamedTuple):
+    """The last K steps of a rollout, of B sequences: what behaviour is learned from."""
+
+    latent: Latent  # [B, K, ...]
+    feature: Array  # float32 [B, K, F]
+    reward: Array  # float32 [B, K]
+    is_last: Array  # bool [B, K]
+    is_terminal: Array  # bool [B, K]
+
+    @classmethod
+    def of(cls, rollout: Rollout, steps: int | None) -> Replayed:
+        """All of the rollout's steps where ``steps`` is none or more than there are."""
+        batch = rollout.batch
+        all_of_it = cls(rollout.latent, rollout.feature, batch.reward, batch.is_last, batch.is_terminal)
+        return all_of_it if steps is None else jax.tree.map(lambda x: x[:, -steps:], all_of_it)
 
 
 def _replay_critic_loss(
-    nets: Networks, config: BehaviorConfig, params: Params, slow_value, rollout: Rollout, imagined_return: Array
+    nets: Networks, config: BehaviorConfig, params: Params, slow_value, replayed: Replayed, imagined_return: Array
 ) -> Array:
-    """Critic loss [B, T - 1] on replayed rewards, bootstrapped by the imagined return from each state [B*T].
-
-    T is that of the rollout, which may have been cut to its last steps.
-    """
-    batch = rollout.batch
-    bootstrap = jax.lax.stop_gradient(imagined_return).reshape(batch.reward.shape)
-    discount = config.discount * (1 - batch.is_terminal.astype(jnp.float32))
-    returns = lambda_returns(batch.reward, bootstrap, discount, config.lam, batch.is_last)
+    """Critic loss [B, K - 1] on replayed rewards, bootstrapped by the imagined return from each state [B*K]."""
+    bootstrap = jax.lax.stop_gradient(imagined_return).reshape(replayed.reward.shape)
+    discount = config.discount * (1 - replayed.is_terminal.astype(jnp.float32))
+    returns = lambda_returns(replayed.reward, bootstrap, discount, config.lam, replayed.is_last)
     bins = symexp_bins(nets.heads.bins)
-    logits = nets.apply("critic", params, rollout.feature[:, :-1])
-    slow = slow_value(jax.lax.stop_gradient(rollout.feature[:, :-1]))
+    logits = nets.apply("critic", params, replayed.feature[:, :-1])
+    slow = slow_value(jax.lax.stop_gradient(replayed.feature[:, :-1]))
     # A last step has no return of its own: what follows it in the sequence is another episode.
-    weight = 1 - batch.is_last[:, :-1].astype(jnp.float32)
+    weight = 1 - replayed.is_last[:, :-1].astype(jnp.float32)
     return critic_loss(logits, returns, slow, weight, bins, config.slow_scale)
