@@ -28,6 +28,7 @@ class Option(click.ParamType):
         name, equals, text = value.partition("=")
         if not (name and equals):
             self.fail(f"expected NAME=VALUE, got {value!r}", param, ctx)
+        name = name.removeprefix("env.")  # as the training command has it
         try:
             return name, json.loads(text)
         except json.JSONDecodeError:

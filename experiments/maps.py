@@ -31,7 +31,10 @@ class PlayerName(click.ParamType):
         marker = run_directory.RunDirectory(Path(value).expanduser()).marker
         if value not in PLAYERS and not marker.exists():
             self.fail(
-                f"no player is called {value!r}, and no run lies there. {did_you_mean(value, PLAYERS)}", param, ctx
+                f"no player is called {value!r}, and no run lies there. {did_you_mean(value, PLAYERS)} Or the --logdir "
+                "of a run that was trained",
+                param,
+                ctx,
             )
         return value
 
@@ -44,7 +47,8 @@ class PlayerName(click.ParamType):
     default="scripted",
     show_default=True,
     metavar="PLAYER",
-    help="scripted: knows all and plans; forgetful: goes by what it sees at the moment; random; or a run's directory.",
+    help="scripted: forgets nothing, and plans; forgetful: goes by what it sees at the moment; random; or a run's "
+    "directory.",
 )
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the episode.")
 @click.option("--image-size", type=click.IntRange(8, 4_096), default=64, show_default=True, help="But of a run's own.")
@@ -62,12 +66,15 @@ def main(task: str, player: str, seed: int, image_size: int, output: Path) -> No
     frames beside it were seen. A dotted circle is what can't be seen.
     """
     quiet()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise click.UsageError(f"--output: {output} can't be made: {error.strerror or error}") from error
     from ne_dreamer_jax.runs import checkpoint, maps, pictures, video
 
     with refusing(ValueError, run_directory.RefusedError, FileNotFoundError, checkpoint.DamagedError):
         find_devices()
         seen, seconds = played(task, player, seed, image_size)
-    output.mkdir(parents=True, exist_ok=True)
     stem, title = output / task.removeprefix("rooms/"), f"{task}, {Path(player).name}"
     draw = {
         stem.with_suffix(".png"): lambda path: maps.picture(seen, path, title),

@@ -26,6 +26,8 @@ class Family(NamedTuple):
     """Those that can be made, as far as that is known without loading anything."""
     check: Callable[[str], Any] | None = None
     """Raises ValueError for a name that is none, where ``names`` does not say."""
+    options: tuple[str, ...] | None = None
+    """That ``make`` takes; None where it depends on the environment."""
 
 
 def _adapters() -> Any:
@@ -33,8 +35,10 @@ def _adapters() -> Any:
 
 
 FAMILIES: dict[str, Family] = {
-    "dmc/": Family("ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES),
-    "rooms/": Family("ne_dreamer_jax.envs.rooms.tasks", lambda: ROOMS_NAMES),
+    "dmc/": Family(
+        "ne_dreamer_jax.envs.dmc.tasks", lambda: DMC_NAMES, options=("obs", "action_repeat", "image_size", "fast")
+    ),
+    "rooms/": Family("ne_dreamer_jax.envs.rooms.tasks", lambda: ROOMS_NAMES, options=("image_size", "length")),
     "jax:": Family("ne_dreamer_jax.envs.adapters", lambda: (), lambda name: _adapters().check_installed(name)),
     **{prefix: Family("ne_dreamer_jax.envs.host", lambda: (), host_names.check) for prefix in host_names.LIBRARIES},
 }
@@ -99,7 +103,11 @@ def make(name: str, **options: Any) -> Any:
     check(name)
     prefix = family_of(name)
     if prefix is not None:
-        return importlib.import_module(FAMILIES[prefix].module).make(name, **options)
+        family = FAMILIES[prefix]
+        for option in options if family.options is not None else ():
+            if option not in (family.options or ()):
+                raise ValueError(f"{name} has no option {option!r}. {did_you_mean(option, family.options or ())}")
+        return importlib.import_module(family.module).make(name, **options)
     if options:
         raise ValueError(
             f"{name}: expected no options for an environment of one's own, which says itself how it is observed; got "

@@ -222,11 +222,12 @@ def check_capacity(
     needed = nbytes(example, capacity, num_envs, deter_dtype)
     if needed > available:
         fits = capacity_for(example, available, num_envs, deter_dtype)
-        smaller = "" if jnp.dtype(deter_dtype).itemsize < 4 else ", or store the latents in bfloat16 (deter_dtype)"
+        halved = "" if jnp.dtype(deter_dtype).itemsize < 4 else "; loop.latent_dtype=bfloat16 halves the latents"
         each, takes, free = (memory.readable(x) for x in (needed // capacity, needed, available))
         raise ValueError(
             f"a replay of {capacity:,} steps takes {takes}, and {free} are free for it; expected a capacity of at most "
-            f"{fits:,} steps ({each} each){smaller}"
+            f"{fits:,} steps ({each} each; loop.capacity). loop.storage=states stores what images are drawn from in "
+            f"their place, where they can be drawn again{halved}"
         )
 
 

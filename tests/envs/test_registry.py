@@ -58,6 +58,7 @@ def test_a_name_like_no_other_is_refused_with_the_list():
         ({"action_repeat": 0}, r"action_repeat to be a positive int, got 0"),
         ({"image_size": 64.0}, r"image_size to be a positive int, got 64\.0"),
         ({"fast": 1}, r"fast to be True or False, got 1"),
+        ({"image_sise": 64}, r"dmc/pendulum_swingup has no option 'image_sise'. Did you mean image_size"),
     ],
 )
 def test_bad_options_are_refused(options, message):
