@@ -149,6 +149,7 @@ def test_an_environment_that_never_ends_is_evaluated_up_to_the_bound(tmp_path):
     assert all(100 <= length < 200 for length in result["policy"]["lengths"])
 
 
+@pytest.mark.slow
 def test_without_evaluations_there_are_none(tmp_path):
     said = []
     assert nedreamer.train(toy.config(eval_every=None), tmp_path / "run", env=endless(), echo=said.append).code == 0
