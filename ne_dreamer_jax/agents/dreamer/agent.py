@@ -253,12 +253,12 @@ def parameter_counts(params: Params) -> dict[str, int]:
 
 
 def _working_bytes(config: AgentConfig, feature: int, params: Params) -> int:
-    """The gradients; as much as some arrays of all imagined features of a microbatch; the encoder's, by frames."""
+    """The gradients; as much as some arrays of all imagined features of a microbatch; the encoder's, by frames.
+
+    Imagined from all states: with fewer (`BehaviorConfig.imagine_last`) the peak lies elsewhere, and little below.
+    """
     steps = config.batch_size * config.batch_length // config.microbatches
-    starts = (
-        steps // config.batch_length * min(config.behavior.imagine_last or config.batch_length, config.batch_length)
-    )
-    imagined = 4 * feature * starts * (config.behavior.horizon + 1)
+    imagined = 4 * feature * steps * (config.behavior.horizon + 1)
     arrays = REINFORCE_ARRAYS if config.behavior.gradient == "reinforce" else DYNAMICS_ARRAYS
     return 4 * sum(parameter_counts(params).values()) + int(arrays * imagined) + FRAME_BYTES * steps
 
