@@ -26,8 +26,6 @@ chance there is nothing to learn from, and in 5,000 updates that happens with mo
 UNABLE = {
     ("drqv2", "cue"): "it sees three frames and remembers nothing",
     ("drqv2", "cue_again"): "likewise",
-    ("dreamer_no_reconstruction", "cue"): "nothing tells it of a cue until a reward, much later, depends on it",
-    ("dreamer_no_reconstruction", "cue_again"): "likewise: what it sees again has no part in its losses",
 }
 
 

@@ -314,6 +314,7 @@ def test_a_task_may_end_an_episode_at_any_control_step():
         assert float(state.physics.time) == pytest.approx(0.12)
 
 
+@pytest.mark.slow
 def test_python_numbers_serve_as_rewards_and_observations():
     env = dmc.from_task(linked_task(reward=lambda *_: 2.5, observe=lambda *_: {"x": 1.0}), obs="vector")
     state, timestep = env.step(env.prepare(jax.random.key(0)), jnp.zeros(1))
