@@ -156,7 +156,7 @@ def _device(target: str) -> Any:
         return jax.devices("cpu")[0]
     try:
         topology = topologies.get_topology_desc(platform=target, topology_name="", target_config=H100, topology="1x1x1")
-    except Exception as error:  # whatever the plugin raises
+    except RuntimeError as error:
         raise ValueError(
             f"expected XLA's compiler for {target} (pip install 'ne-dreamer-jax[cuda]'), got {error}"
         ) from error

@@ -104,9 +104,10 @@ def make(name: str, **options: Any) -> Any:
     prefix = family_of(name)
     if prefix is not None:
         family = FAMILIES[prefix]
-        for option in options if family.options is not None else ():
-            if option not in (family.options or ()):
-                raise ValueError(f"{name} has no option {option!r}. {did_you_mean(option, family.options or ())}")
+        known = options if family.options is None else family.options
+        for option in options:
+            if option not in known:
+                raise ValueError(f"{name} has no option {option!r}. {did_you_mean(option, known)}")
         return importlib.import_module(family.module).make(name, **options)
     if options:
         raise ValueError(

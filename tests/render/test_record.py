@@ -10,6 +10,7 @@ import pytest
 
 from ne_dreamer_jax import envs, render
 from ne_dreamer_jax.envs import dmc
+from tests.marks import slow_but
 
 TASKS = {"cartpole": "swingup", "ball_in_cup": "catch", "finger": "turn_hard", "walker": "walk", "quadruped": "walk"}
 QUICK = ("cartpole",)  # the smallest
@@ -28,7 +29,7 @@ def moved(model, count):
 
 
 @pytest.mark.strict
-@pytest.mark.parametrize("domain", [pytest.param(d, marks=[] if d in QUICK else [pytest.mark.slow]) for d in TASKS])
+@pytest.mark.parametrize("domain", slow_but(TASKS, *QUICK))
 def test_a_picture_is_drawn_again_to_the_bit(domain):
     task = dmc.load(domain, TASKS[domain])
     scene = render.build(task.simulation.mj_model, task.camera, height=64, width=64)

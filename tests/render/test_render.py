@@ -16,6 +16,7 @@ import pytest
 from benchmarks import mujoco_pictures
 from benchmarks.render import similarity
 from ne_dreamer_jax import render
+from tests.marks import slow_but
 
 STORED = pathlib.Path(__file__).parent / "references.npz"
 # Mean absolute error (of 255) and structural similarity on the stored states, with a margin of a tenth over what they
@@ -36,9 +37,7 @@ QUICK = ("cartpole", "walker")  # one with a camera that stands and one with a c
 POSE = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "xpos", "subtree_com")
 
 
-@pytest.mark.parametrize(
-    "domain", [pytest.param(d, marks=[] if d in QUICK else [pytest.mark.slow]) for d in mujoco_pictures.TASKS]
-)
+@pytest.mark.parametrize("domain", slow_but(mujoco_pictures.TASKS, *QUICK))
 def test_pictures_equal_mujocos(domain, quick_compilation):
     stored = mujoco_pictures.load(STORED, domain)
     draw = jax.jit(mujoco_pictures.drawer(render.build(stored.model, stored.camera)))
