@@ -45,7 +45,7 @@ EVALUATION = 2**31 - 1
 """The seed of the episodes of evaluations."""
 
 WORLD_MODEL = AgentConfig(
-    encoder=EncoderConfig(depth=8, layers=1, units=32),
+    encoder=EncoderConfig(depth=8, multipliers=(2, 3), layers=1, units=32),
     rssm=RSSMConfig(deter=64, stoch=4, classes=8, hidden=32, blocks=2, prior_layers=1),
     heads=HeadsConfig(units=32, actor_layers=1, critic_layers=1),
     objective=NextEmbedding(PredictorConfig(layers=1, width=32, heads=2, feedforward=64, positions=16)),

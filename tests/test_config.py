@@ -246,7 +246,14 @@ BASE = Config(
 )
 
 CHANGES = {
-    "agent.encoder": {"depth": "2", "multipliers": "2,2", "kernel": "5", "layers": "2", "units": "4"},
+    "agent.encoder": {
+        "depth": "2",
+        "multipliers": "2,2",
+        "kernel": "5",
+        "patch": "4",
+        "layers": "2",
+        "units": "4",
+    },
     "agent.rssm": {
         "deter": "16",
         "stoch": "3",

@@ -20,7 +20,7 @@ from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, TimeStep
 
 SPEC = EnvSpec({"vector": ArraySpec((3,), jnp.float32)}, ContinuousAction(1))
-PICTURE = EnvSpec({"image": ArraySpec((16, 16, 3), jnp.uint8)}, SPEC.action)
+PICTURE = EnvSpec({"image": ArraySpec((8, 8, 3), jnp.uint8)}, SPEC.action)
 
 
 class Probe(NamedTuple):

@@ -99,9 +99,30 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
     return lax_encode_images(images, stages, dtype)
 
 
+def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Array:
+    """Each p x p patch of pixels to a vector: ``[N, H, W, C]`` to ``[N, H / p, W / p, C_out]`` of ``dtype``.
+
+    A convolution of stride p with the stage's kernel ``[p, p, C, C_out]`` and bias, an RMSNorm over channels in float32
+    and SiLU: one matrix product, for which no image is taken apart pixel by pixel. Images as `encode_images` takes
+    them. Raises ValueError where p does not divide the sides.
+    """
+    p, _, C, C_out = stage.kernel.shape
+    N, H, W, _ = images.shape
+    if H % p or W % p:
+        raise ValueError(f"Expected sides that are multiples of the patches' {p}, got {list(images.shape)}.")
+    x = _to_float(images).astype(dtype)
+    x = x.reshape(N, H // p, p, W // p, p, C).transpose(0, 1, 3, 2, 4, 5).reshape(N, H // p, W // p, p * p * C)
+    x = x @ stage.kernel.reshape(-1, C_out).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
+    return jax.nn.silu(rms_norm(x, stage.scale))
+
+
+def _to_float(images: Array) -> Array:
+    return images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images
+
+
 def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
     """`encode_images` as a composition of XLA's own operations."""
-    x = (images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images).astype(dtype)
+    x = _to_float(images).astype(dtype)
     for stage in stages:
         x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
         x = jax.nn.silu(rms_norm(x, stage.scale))

@@ -24,12 +24,20 @@ def spread_blocks(x: Array, height: int, width: int) -> Array:
     return x.reshape(N, G, height, width, -1).transpose(0, 2, 3, 1, 4).reshape(N, height, width, -1)
 
 
+def join_patches(x: Array, side: int) -> Array:
+    """``[N, height, width, side * side * C]`` to ``[N, height * side, width * side, C]``, each vector a square."""
+    N, height, width, size = x.shape
+    x = x.reshape(N, height, width, side, side, size // side**2).swapaxes(2, 3)
+    return x.reshape(N, height * side, width * side, -1)
+
+
 class Decoder(nn.Module):
     """Images from a block-linear map of h_t plus a two-layer path from z_t, upsampled by 5x5 convolutions; vectors by a
     multilayer perceptron on the feature.
 
     Channels, widths and layers are the encoder's. A stage is nearest upsampling by two, a convolution (stride 1, same
-    padding, bias), RMSNorm over channels and SiLU; the last has a sigmoid instead of norm and SiLU.
+    padding, bias), RMSNorm over channels and SiLU; the last has a sigmoid instead of norm and SiLU, and is a linear map
+    to patches of pixels where the encoder's first stage is one of patches.
     """
 
     config: EncoderConfig  # of the encoder that is mirrored
@@ -63,14 +71,16 @@ class Decoder(nn.Module):
         c, dtype = self.config, self.dtype
         images, _ = split_observation(self.observation)
         depths = [c.depth * multiplier for multiplier in c.multipliers]
-        height, width = (side // 2 ** len(depths) for side in self.observation[images[0]].shape[:2])
+        height, width = (side // c.factor for side in self.observation[images[0]].shape[:2])
         x = self._from_deter(latent.deter, height, width, depths[-1])
         hidden = Block(2 * c.units, dtype, name="stoch_in")(latent.stoch.reshape(latent.stoch.shape[0], -1))
         x = x + Linear(height * width * depths[-1], dtype=dtype, name="stoch_out")(hidden).reshape(x.shape)
         x = nn.silu(RMSNorm(name="norm")(x))
         for i, depth in reversed(list(enumerate(depths[:-1]))):
             x = nn.silu(RMSNorm(name=f"stage{i + 1}_norm")(self._upsampled(x, f"stage{i + 1}", depth)))
-        return nn.sigmoid(self._upsampled(x, "stage0", channels))
+        if c.patch is None:
+            return nn.sigmoid(self._upsampled(x, "stage0", channels))
+        return nn.sigmoid(join_patches(Linear(c.patch**2 * channels, dtype=dtype, name="stage0")(x), c.patch))
 
     def _from_deter(self, deter: Array, height: int, width: int, channels: int) -> Array:
         """``[N, D]`` to ``[N, height, width, channels]``."""

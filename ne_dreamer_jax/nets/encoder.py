@@ -28,6 +28,10 @@ class EncoderConfig:
     """One convolution stage, which halves the sides, for each entry."""
     kernel: Annotated[int, Range(1, 1_000)] = 5
     """Side of the convolution kernels."""
+    patch: Annotated[int, Range(2, 4_096)] | None = None
+    """The first stage maps squares of so many pixels a side, which do not overlap, to vectors (a convolution of that
+    stride, and no pool; DreamerV3 has none such): a fraction of the work where sides are 32 pixels. None: it is a
+    convolution as the others are."""
     layers: Annotated[int, Range(1, 1_000)] = 3
     """Layers of the multilayer perceptron for vectors."""
     units: Width = 256
@@ -37,6 +41,12 @@ class EncoderConfig:
         ranges.check(self)
         if not self.multipliers:
             raise ValueError("encoder.multipliers: expected one or more, got none.")
+
+    @property
+    def factor(self) -> int:
+        """By which an image's sides are divided."""
+        halved = len(self.multipliers)
+        return 2**halved if self.patch is None else self.patch * 2 ** (halved - 1)
 
 
 def split_observation(observation: Mapping[str, ArraySpec]) -> tuple[list[str], list[str]]:
@@ -66,7 +76,7 @@ def embedding_size(config: EncoderConfig, observation: Mapping[str, ArraySpec]) 
     size = config.units if vectors else 0
     if images:
         shapes = {observation[name].shape[:2] for name in images}
-        factor = 2 ** len(config.multipliers)
+        factor = config.factor
         if len(shapes) > 1 or any(side % factor for side in next(iter(shapes))):
             raise ValueError(
                 f"Images: expected one common height and width, each a multiple of {factor}, got "
@@ -80,7 +90,8 @@ def embedding_size(config: EncoderConfig, observation: Mapping[str, ArraySpec]) 
 class Encoder(nn.Module):
     """Convolution stages for images, a multilayer perceptron on symlog for vectors; the two concatenated.
 
-    A stage is a convolution (stride 1, same padding, bias), 2x2 max-pool, RMSNorm over channels and SiLU.
+    A stage is a convolution (stride 1, same padding, bias), 2x2 max-pool, RMSNorm over channels and SiLU; the first one
+    may be of patches instead (`EncoderConfig.patch`).
     """
 
     config: EncoderConfig
@@ -96,7 +107,12 @@ class Encoder(nn.Module):
         parts = []
         if images:
             x = jnp.concatenate([obs[name].reshape(-1, *self.observation[name].shape) for name in images], axis=-1)
-            parts.append(conv.encode_images(x, self._stages(x.shape[-1]), self.dtype).reshape(*leading, -1))
+            stages = self._stages(x.shape[-1])
+            if self.config.patch is not None:
+                x = conv.embed_patches(x, stages[0], self.dtype)
+                stages = stages[1:]
+            x = conv.encode_images(x, stages, self.dtype) if stages else x
+            parts.append(x.reshape(*leading, -1))
         if vectors:
             flat = [obs[name].reshape(*leading, -1) for name in vectors]
             x = symlog(jnp.concatenate(flat, axis=-1))
@@ -107,7 +123,8 @@ class Encoder(nn.Module):
         stages = []
         for i, multiplier in enumerate(self.config.multipliers):
             out = self.config.depth * multiplier
-            shape = (self.config.kernel, self.config.kernel, channels, out)
+            side = self.config.patch if i == 0 and self.config.patch is not None else self.config.kernel
+            shape = (side, side, channels, out)
             stages.append(
                 conv.Stage(
                     kernel=self.param(f"stage{i}_kernel", kernel_init(), shape, jnp.float32),

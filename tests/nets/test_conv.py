@@ -112,6 +112,27 @@ def test_uint8_images_are_centred_and_kernels_get_their_gradients():
     _assert_close(actual, _with_gradients(lambda stages: _reference(centred, stages), g, stages))
 
 
+@pytest.mark.parametrize("side", [2, 4])
+def test_patches_equal_a_strided_convolution(side):
+    stage, images = _stages((3, 5), side)[0], _normal(0, 3, 8, 12, 3)
+
+    def reference(images, stage):
+        strides = (side, side)
+        x = jax.lax.conv_general_dilated(
+            images, stage.kernel, strides, "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        x = x + stage.bias[None, None, None]
+        x = x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + 1e-4) * stage.scale[None, None, None]
+        return jax.nn.silu(x)
+
+    g = _normal(2, 3, 8 // side, 12 // side, 5)
+    _assert_close(_with_gradients(conv.embed_patches, g, images, stage), _with_gradients(reference, g, images, stage))
+    pixels = jnp.asarray(np.random.default_rng(0).integers(0, 256, (3, 8, 12, 3), np.uint8))
+    centred = pixels.astype(jnp.float32) / 255 - 0.5
+    _assert_close(conv.embed_patches(pixels, stage), reference(centred, stage))
+    assert conv.embed_patches(pixels, stage, jnp.bfloat16).dtype == jnp.bfloat16
+
+
 @pytest.mark.parametrize(("taps", "dtype", "tolerance"), [(3, jnp.float32, 3e-5), (5, jnp.bfloat16, 5e-2)])
 def test_encoder_without_a_lowering_of_its_own_is_xlas(taps, dtype, tolerance):
     stages, images = _stages((3, 4, 6), taps), _normal(0, 2, 8, 8, 3)
@@ -165,3 +186,5 @@ def test_messages_say_what_was_expected():
         conv.conv2d(jnp.zeros((1, 4, 4, 3)), jnp.zeros((5, 5, 4, 2)))
     with pytest.raises(ValueError, match=r"multiples of 4.*\[1, 6, 8, 3\]"):
         conv.encode_images(jnp.zeros((1, 6, 8, 3)), _stages((3, 4, 6)))
+    with pytest.raises(ValueError, match=r"multiples of the patches' 4, got \[1, 6, 8, 3\]"):
+        conv.embed_patches(jnp.zeros((1, 6, 8, 3)), _stages((3, 4), 4)[0])

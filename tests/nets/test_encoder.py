@@ -1,5 +1,7 @@
 """Which observations are encoded how."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from ne_dreamer_jax.types import ArraySpec
 from tests import tiny
 
 CONFIG = EncoderConfig(depth=1, multipliers=(2, 3), kernel=3, layers=1, units=8)
+PATCHES = replace(CONFIG, patch=4)
 OBS = {
     "wide": ArraySpec((16, 8, 3), jnp.uint8),
     "depth": ArraySpec((16, 8, 1), jnp.uint8),
@@ -56,19 +59,21 @@ def test_images_that_do_not_halve_or_agree_are_refused(shapes):
         embedding_size(CONFIG, {f"image{i}": ArraySpec(s, jnp.uint8) for i, s in enumerate(shapes)})
 
 
+@pytest.mark.parametrize("config", [CONFIG, PATCHES, replace(PATCHES, multipliers=(2,))])
 @pytest.mark.parametrize("names", [["wide", "depth", "touch", "speed"], ["wide"], ["touch"], ["speed", "touch"]])
-def test_the_embedding_has_the_size_that_is_announced(names):
+def test_the_embedding_has_the_size_that_is_announced(names, config):
     observation = {name: OBS[name] for name in names}
-    encoder = Encoder(CONFIG, observation)
+    encoder = Encoder(config, observation)
     obs = observations(observation, (2, 3))
     got = jax.eval_shape(lambda: encoder.init_with_output(jax.random.key(0), obs)[0])
-    assert got.shape == (2, 3, embedding_size(CONFIG, observation))
+    assert got.shape == (2, 3, embedding_size(config, observation))
     assert got.dtype == jnp.float32
 
 
 @pytest.mark.usefixtures("quick_compilation")
-def test_every_row_and_every_observation_counts_and_leading_axes_do_not():
-    encoder = Encoder(CONFIG, OBS)
+@pytest.mark.parametrize("config", [CONFIG, PATCHES])
+def test_every_row_and_every_observation_counts_and_leading_axes_do_not(config):
+    encoder = Encoder(config, OBS)
     obs = observations(OBS, (2, 3))
     params = tiny.fill(jax.eval_shape(encoder.init, jax.random.key(0), obs))
     encode = jax.jit(encoder.apply)
