@@ -21,14 +21,23 @@ from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.option("--size", type=Name("size", names.SIZES), default="12m", show_default=True)
+@click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
+@click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
 @click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
 @click.option("--parts/--no-parts", default=True, show_default=True, help="Whether to time the parts too.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
-def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignments: tuple[str, ...]) -> None:
-    """Time the update of a size on 64x64x3 frames (drqv2: 84x84x3), in seconds and in GEMM units."""
+def main(
+    preset: str,
+    size: str | None,
+    method: str,
+    actions: int,
+    rounds: int,
+    parts: bool,
+    assignments: tuple[str, ...],
+) -> None:
+    """Time the update of a preset's agent on its frames (drqv2 in the paper's: 84x84x3), in seconds and GEMM units."""
     quiet()
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.agents.dreamer.agent import AgentConfig, parameter_counts
@@ -36,7 +45,7 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     with refusing(ValueError):
-        run = configure(size, method, assignments)
+        run = configure(size, method, assignments, preset)
         config, side = run.agent, run.env.image_size
         spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
         agent = make_agent(config, spec)
@@ -60,6 +69,7 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
         "train_step",
         measured,
         settings={
+            "preset": preset,
             "size": size,
             "method": method,
             "batch_size": config.batch_size,
@@ -72,11 +82,11 @@ def main(size: str, method: str, actions: int, rounds: int, parts: bool, assignm
     )
 
 
-def configure(size: str, method: str, assignments: tuple[str, ...]) -> Any:
+def configure(size: str | None, method: str, assignments: tuple[str, ...], preset: str = "dmc") -> Any:
     """The config of a size and method with settings changed. Raises ValueError as the training command does."""
     from experiments.train import configure as configure_run
 
-    return configure_run("dmc", size, method, {}, assignments)
+    return configure_run(preset, size, method, {}, assignments)
 
 
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:

@@ -86,6 +86,35 @@ def rooms(size: str) -> Config:
     return Config(RoomsConfig(), agent_config(size), loop)
 
 
+def _small_agent(size: str) -> AgentConfig:
+    """What the agents for a CPU share: sequences of 16 steps and a smaller predictor."""
+    return replace(
+        agent_config(size),
+        objective=NextEmbedding(PredictorConfig(layers=1, width=128, feedforward=256)),
+        batch_size=16,
+        batch_length=16,
+    )
+
+
+def laptop(size: str) -> Config:
+    """For returns a minute of a CPU core: less than half the quickstart's work for an update.
+
+    Against the quickstart: frames are encoded in patches of 4 x 4; behaviour is learned from the last four steps of
+    each sequence alone, over two steps more; more environments, for their steps cost little beside an update; the
+    learning rate is two and a half times as large, and the discount farther. experiments/RESULTS.md says what else was
+    tried.
+    """
+    small = _small_agent(size)
+    agent = replace(
+        small,
+        encoder=replace(small.encoder, patch=4, multipliers=(4, 4, 4)),
+        behavior=BehaviorConfig(horizon=12, imagine_last=4, discount=0.99, return_floor=0.1),
+        optimizer=OptimizerConfig(learning_rate=1e-3, warmup=100),
+    )
+    loop = LoopConfig(env_steps=500_000, num_envs=16, replay_ratio=32.0, prefill=2_000, eval_every=20_000)
+    return Config(DmcConfig(image_size=32), agent, loop)
+
+
 def quickstart(size: str) -> Config:
     """Learns in minutes on two CPU cores.
 
@@ -93,14 +122,10 @@ def quickstart(size: str) -> Config:
     learning rate and a nearer discount, which suits the few updates that there are. Returns are divided by as little
     as 0.1, not 1: cheetah's first rewards are hundredths, and would teach the actor nothing beside its entropy.
     """
-    base = agent_config(size)
     agent = replace(
-        base,
-        objective=NextEmbedding(PredictorConfig(layers=1, width=128, feedforward=256)),
+        _small_agent(size),
         behavior=BehaviorConfig(horizon=10, discount=0.98, entropy=1e-3, return_floor=0.1),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
-        batch_size=16,
-        batch_length=16,
     )
     loop = LoopConfig(
         env_steps=20_000, num_envs=8, replay_ratio=96.0, prefill=1_000, eval_every=5_000, eval_episodes=10
@@ -109,18 +134,18 @@ def quickstart(size: str) -> Config:
 
 
 def rooms_small(size: str) -> Config:
-    """Learns to remember in half an hour of a CPU core: the quickstart's agent with half the state, on a small task.
+    """Learns to remember in half an hour of a CPU core: a small agent with half the state, on a small task.
 
     Frames of 24 x 24 are halved three times. A trial of the task takes some nine steps, so that most of the sequences
     of 16 hold what is to be remembered and what comes of it; returns are in tens, and need no smaller floor than 1.
     """
-    config = quickstart(size)
-    assert isinstance(config.agent, AgentConfig)
+    small = _small_agent(size)
     agent = replace(
-        config.agent,
-        encoder=replace(config.agent.encoder, multipliers=(2, 3, 4)),
-        rssm=replace(config.agent.rssm, deter=config.agent.rssm.deter // 2),
-        behavior=replace(config.agent.behavior, horizon=8, return_floor=1.0),
+        small,
+        encoder=replace(small.encoder, multipliers=(2, 3, 4)),
+        rssm=replace(small.rssm, deter=small.rssm.deter // 2),
+        behavior=BehaviorConfig(horizon=8, discount=0.98, entropy=1e-3),
+        optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
     )
     loop = LoopConfig(env_steps=320_000, replay_ratio=32.0, prefill=2_000, eval_every=32_000, eval_episodes=32)
     return Config(RoomsConfig("rooms/select_nonmatching_object_small", image_size=24), agent, loop)
@@ -176,6 +201,7 @@ PRESETS = {
     "rooms": (rooms, "12m"),
     "rooms_small": (rooms_small, "1m"),
     "released_code": (released_code, "12m"),
+    "laptop": (laptop, "1m"),
     "quickstart": (quickstart, "1m"),
     "smoke": (smoke, "1m"),
 }

@@ -28,7 +28,7 @@ METHODS = (
     *(f"{method}{name}" for method in OBJECTIVES for name in ("", *(f"/{n}" for n in ABLATIONS.get(method, ())))),
     DRQV2,
 )
-PRESETS = ("dmc", "rooms", "rooms_small", "released_code", "quickstart", "smoke")
+PRESETS = ("dmc", "rooms", "rooms_small", "released_code", "laptop", "quickstart", "smoke")
 SIZES = ("1m", "12m", "25m", "50m", "100m", "200m", "400m")
 OBSERVATIONS = ("pixels", "vector", "both")
 
