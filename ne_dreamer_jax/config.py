@@ -100,16 +100,18 @@ def laptop(size: str) -> Config:
     """For returns a minute of a CPU core: less than half the quickstart's work for an update.
 
     Against the quickstart: frames are encoded in patches of 4 x 4; behaviour is learned from the last four steps of
-    each sequence alone, over two steps more; more environments, for their steps cost little beside an update; the
-    learning rate is two and a half times as large, and the discount farther. experiments/RESULTS.md says what else was
-    tried.
+    each sequence alone, over two steps more; its gradient comes through the world model, which few trajectories are
+    enough for, and with more weight on the entropy, without which such a policy soon tries nothing new; more
+    environments, for their steps cost little beside an update. experiments/RESULTS.md says what else was tried.
     """
     small = _small_agent(size)
     agent = replace(
         small,
         encoder=replace(small.encoder, patch=4, multipliers=(4, 4, 4)),
-        behavior=BehaviorConfig(horizon=12, imagine_last=4, discount=0.99, return_floor=0.1),
-        optimizer=OptimizerConfig(learning_rate=1e-3, warmup=100),
+        behavior=BehaviorConfig(
+            horizon=12, imagine_last=4, discount=0.98, entropy=3e-3, gradient="dynamics", return_floor=0.1
+        ),
+        optimizer=OptimizerConfig(learning_rate=5e-4, warmup=100),
     )
     loop = LoopConfig(env_steps=500_000, num_envs=16, replay_ratio=32.0, prefill=2_000, eval_every=20_000)
     return Config(DmcConfig(image_size=32), agent, loop)
