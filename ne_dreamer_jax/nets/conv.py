@@ -103,8 +103,8 @@ def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Arra
     """Each p x p patch of pixels to a vector: ``[N, H, W, C]`` to ``[N, H / p, W / p, C_out]`` of ``dtype``.
 
     A convolution of stride p with the stage's kernel ``[p, p, C, C_out]`` and bias, an RMSNorm over channels in float32
-    and SiLU: one matrix product, for which no image is taken apart pixel by pixel. Images as `encode_images` takes
-    them. Raises ValueError where p does not divide the sides.
+    and SiLU: one matrix product. Images as `encode_images` takes them. Raises ValueError where p does not divide the
+    sides.
     """
     p, _, C, C_out = stage.kernel.shape
     N, H, W, _ = images.shape
