@@ -100,9 +100,9 @@ def laptop(size: str) -> Config:
     """For returns a minute of a CPU core: less than half the quickstart's work for an update.
 
     Against the quickstart: frames are encoded in patches of 4 x 4; behaviour is learned from the last four steps of
-    each sequence alone, over two steps more; its gradient comes through the world model, which few trajectories are
-    enough for, and with more weight on the entropy, without which such a policy soon tries nothing new; more
-    environments, for their steps cost little beside an update. experiments/RESULTS.md says what else was tried.
+    each sequence alone, over two steps more; its gradient comes through the world model, with more weight on the
+    entropy, which the policy otherwise loses within a thousand updates; more environments, for their steps cost little
+    beside an update. experiments/RESULTS.md says what else was tried, and that it has not solved a task yet.
     """
     small = _small_agent(size)
     agent = replace(
