@@ -41,6 +41,7 @@ def main(
     quiet()
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.agents.dreamer.agent import AgentConfig, parameter_counts
+    from ne_dreamer_jax.config import PRESETS
     from ne_dreamer_jax.replay import ring as replay
     from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
@@ -70,7 +71,7 @@ def main(
         measured,
         settings={
             "preset": preset,
-            "size": size,
+            "size": size or PRESETS[preset][1],
             "method": method,
             "batch_size": config.batch_size,
             "batch_length": config.batch_length,

@@ -97,7 +97,7 @@ def _small_agent(size: str) -> AgentConfig:
 
 
 def laptop(size: str) -> Config:
-    """For returns a minute of a CPU core: less than half the quickstart's work for an update.
+    """For returns a minute of a CPU core; benchmarks/README.md has the time of an update beside the quickstart's.
 
     Against the quickstart: frames are encoded in patches of 4 x 4; behaviour is learned from the last four steps of
     each sequence alone, over two steps more; its gradient comes through the world model, with more weight on the

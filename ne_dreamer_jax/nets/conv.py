@@ -22,6 +22,7 @@ import numpy as np
 from ne_dreamer_jax.nets.blocks import rms_norm
 from ne_dreamer_jax.nets.cpu import conv as cpu_conv
 from ne_dreamer_jax.nets.cpu.conv import Stage as Stage
+from ne_dreamer_jax.nets.pixels import centred, space_to_depth
 from ne_dreamer_jax.nets.platform import on_cpu
 from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax.types import Array
@@ -106,23 +107,17 @@ def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Arra
     and SiLU: one matrix product. Images as `encode_images` takes them. Raises ValueError where p does not divide the
     sides.
     """
-    p, _, C, C_out = stage.kernel.shape
-    N, H, W, _ = images.shape
-    if H % p or W % p:
+    p, C_out = stage.kernel.shape[0], stage.kernel.shape[3]
+    if any(side % p for side in images.shape[1:3]):
         raise ValueError(f"Expected sides that are multiples of the patches' {p}, got {list(images.shape)}.")
-    x = _to_float(images).astype(dtype)
-    x = x.reshape(N, H // p, p, W // p, p, C).transpose(0, 1, 3, 2, 4, 5).reshape(N, H // p, W // p, p * p * C)
+    x = space_to_depth(centred(images).astype(dtype), p)
     x = x @ stage.kernel.reshape(-1, C_out).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
     return jax.nn.silu(rms_norm(x, stage.scale))
 
 
-def _to_float(images: Array) -> Array:
-    return images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images
-
-
 def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float32) -> Array:
     """`encode_images` as a composition of XLA's own operations."""
-    x = _to_float(images).astype(dtype)
+    x = centred(images).astype(dtype)
     for stage in stages:
         x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
         x = jax.nn.silu(rms_norm(x, stage.scale))

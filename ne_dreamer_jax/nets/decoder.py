@@ -14,6 +14,7 @@ from flax.linen import initializers
 from ne_dreamer_jax.nets import conv
 from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init
 from ne_dreamer_jax.nets.encoder import EncoderConfig, split_observation
+from ne_dreamer_jax.nets.pixels import depth_to_space
 from ne_dreamer_jax.nets.rssm import feature
 from ne_dreamer_jax.types import Array, ArraySpec, Latent
 
@@ -22,13 +23,6 @@ def spread_blocks(x: Array, height: int, width: int) -> Array:
     """``[N, G, height * width * C]`` to ``[N, height, width, G * C]``: each block fills C channels of its own."""
     N, G = x.shape[:2]
     return x.reshape(N, G, height, width, -1).transpose(0, 2, 3, 1, 4).reshape(N, height, width, -1)
-
-
-def join_patches(x: Array, side: int) -> Array:
-    """``[N, height, width, side * side * C]`` to ``[N, height * side, width * side, C]``, each vector a square."""
-    N, height, width, size = x.shape
-    x = x.reshape(N, height, width, side, side, size // side**2).swapaxes(2, 3)
-    return x.reshape(N, height * side, width * side, -1)
 
 
 class Decoder(nn.Module):
@@ -80,7 +74,7 @@ class Decoder(nn.Module):
             x = nn.silu(RMSNorm(name=f"stage{i + 1}_norm")(self._upsampled(x, f"stage{i + 1}", depth)))
         if c.patch is None:
             return nn.sigmoid(self._upsampled(x, "stage0", channels))
-        return nn.sigmoid(join_patches(Linear(c.patch**2 * channels, dtype=dtype, name="stage0")(x), c.patch))
+        return nn.sigmoid(depth_to_space(Linear(c.patch**2 * channels, dtype=dtype, name="stage0")(x), c.patch))
 
     def _from_deter(self, deter: Array, height: int, width: int, channels: int) -> Array:
         """``[N, D]`` to ``[N, height, width, channels]``."""

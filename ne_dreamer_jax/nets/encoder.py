@@ -109,8 +109,7 @@ class Encoder(nn.Module):
             x = jnp.concatenate([obs[name].reshape(-1, *self.observation[name].shape) for name in images], axis=-1)
             stages = self._stages(x.shape[-1])
             if self.config.patch is not None:
-                x = conv.embed_patches(x, stages[0], self.dtype)
-                stages = stages[1:]
+                x, stages = conv.embed_patches(x, stages[0], self.dtype), stages[1:]
             x = conv.encode_images(x, stages, self.dtype) if stages else x
             parts.append(x.reshape(*leading, -1))
         if vectors:
@@ -123,7 +122,7 @@ class Encoder(nn.Module):
         stages = []
         for i, multiplier in enumerate(self.config.multipliers):
             out = self.config.depth * multiplier
-            side = self.config.patch if i == 0 and self.config.patch is not None else self.config.kernel
+            side = self.config.patch or self.config.kernel if i == 0 else self.config.kernel
             shape = (side, side, channels, out)
             stages.append(
                 conv.Stage(

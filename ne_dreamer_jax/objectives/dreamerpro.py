@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from ne_dreamer_jax.losses import assignment_loss, sinkhorn
 from ne_dreamer_jax.nets.blocks import Linear
 from ne_dreamer_jax.nets.microbatches import in_microbatches
+from ne_dreamer_jax.nets.pixels import centred
 from ne_dreamer_jax.objectives.augment import random_shift
 from ne_dreamer_jax.objectives.base import Model, Objective
 from ne_dreamer_jax.settings import ranges
@@ -108,7 +109,7 @@ class DreamerPro:
         def loss(params: Params, target: Params, key: Array, rollout: Rollout) -> tuple[dict[str, Array], Metrics]:
             shift_key, unroll_key = jax.random.split(key)
             batch = _two_views(rollout.batch)
-            shifted = {name: shift(shift_key, _centred(batch.obs[name])) for name in images}
+            shifted = {name: shift(shift_key, centred(batch.obs[name])) for name in images}
             batch = batch._replace(obs={**batch.obs, **shifted})
             views = model.unroll(params, unroll_key, batch)
 
@@ -163,11 +164,6 @@ def _taught(params: Params) -> Params:
 def _two_views(batch: Batch) -> Batch:
     """``[2 * B, ...]``: the batch twice."""
     return jax.tree.map(lambda x: jnp.concatenate([x, x]), batch)
-
-
-def _centred(image: Array) -> Array:
-    """A uint8 image as the encoder's first stage takes it."""
-    return image.astype(jnp.float32) / 255.0 - 0.5
 
 
 def _unit(x: Array) -> tuple[Array, Array]:

@@ -13,9 +13,10 @@ from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
 from ne_dreamer_jax.agents.drqv2.config import DIFFICULTY, NOISE_STEPS, for_task
 from ne_dreamer_jax.agents.drqv2.learner import critic_loss, noise, sample
-from ne_dreamer_jax.agents.drqv2.networks import Networks, space_to_depth, stride_two
+from ne_dreamer_jax.agents.drqv2.networks import Networks, stride_two
 from ne_dreamer_jax.agents.drqv2.transitions import n_step
 from ne_dreamer_jax.envs import registry
+from ne_dreamer_jax.nets.pixels import space_to_depth
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, DiscreteAction, EnvSpec, TimeStep
 from tests.drqv2 import small
 from tests.tiny import assert_same
@@ -66,7 +67,7 @@ def test_a_convolution_of_stride_two_is_one_on_blocks(side):
     numbers = ("NHWC", "HWIO", "NHWC")
     want = jax.lax.conv_general_dilated(x, kernel, (2, 2), "VALID", dimension_numbers=numbers)
     got = jax.lax.conv_general_dilated(
-        space_to_depth(x), stride_two(kernel), (1, 1), "VALID", dimension_numbers=numbers
+        space_to_depth(x, 2), stride_two(kernel), (1, 1), "VALID", dimension_numbers=numbers
     )
     np.testing.assert_allclose(got, want, atol=1e-4)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ne_dreamer_jax.nets.decoder import Decoder, join_patches, spread_blocks
+from ne_dreamer_jax.nets.decoder import Decoder, spread_blocks
 from ne_dreamer_jax.types import ArraySpec
 from tests import tiny
 
@@ -45,15 +45,6 @@ def test_patches_are_decoded_where_patches_are_encoded():
     assert {name: x.shape for name, x in decoded.items()} == {
         name: (2, 5, *(spec.shape or (1,))) for name, spec in OBSERVATION.items()
     }
-
-
-def test_patches_lie_beside_each_other():
-    vectors = np.arange(6, dtype=np.float32).reshape(1, 2, 3, 1) * 100 + np.arange(8, dtype=np.float32)
-    pixels = np.asarray(join_patches(jnp.asarray(vectors), 2))
-    assert pixels.shape == (1, 4, 6, 2)
-    for row, column in np.ndindex(2, 3):
-        square = pixels[0, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-        np.testing.assert_array_equal(square.ravel(), vectors[0, row, column])
 
 
 def test_a_latent_is_decoded_by_itself():

@@ -13,6 +13,7 @@ from flax.linen import initializers
 from ne_dreamer_jax.agents.drqv2.config import DrQv2Config
 from ne_dreamer_jax.nets.conv import conv2d
 from ne_dreamer_jax.nets.encoder import split_observation
+from ne_dreamer_jax.nets.pixels import centred, space_to_depth
 from ne_dreamer_jax.types import Array, ContinuousAction, EnvSpec, Params
 
 LAYER_NORM_EPSILON = 1e-5
@@ -34,8 +35,7 @@ class Encoder(nn.Module):
         parts = [x.reshape(x.shape[0], -1) for x in values if x.dtype != jnp.uint8]
         if images:
             x = jnp.moveaxis(jnp.concatenate(images, axis=-1), 1, -2)
-            x = space_to_depth(x.reshape(*x.shape[:3], -1))
-            x = x.astype(jnp.float32) / 255.0 - 0.5
+            x = centred(space_to_depth(x.reshape(*x.shape[:3], -1), 2))
             for i in range(4):
                 channels = x.shape[-1] if i else x.shape[-1] // 4
                 shape = (3, 3, channels, self.channels)
@@ -45,14 +45,6 @@ class Encoder(nn.Module):
                 x = nn.relu(x + bias[None, None, None])
             parts.append(x.reshape(x.shape[0], -1))
         return jnp.concatenate(parts, axis=-1)
-
-
-def space_to_depth(x: Array) -> Array:
-    """``[N, H, W, C]`` to ``[N, ceil(H / 2), ceil(W / 2), 4 * C]``: each block of 2x2 pixels becomes one."""
-    n, H, W, C = x.shape
-    x = jnp.pad(x, ((0, 0), (0, H % 2), (0, W % 2), (0, 0)))
-    x = x.reshape(n, (H + 1) // 2, 2, (W + 1) // 2, 2, C)
-    return x.transpose(0, 1, 3, 2, 4, 5).reshape(n, (H + 1) // 2, (W + 1) // 2, 4 * C)
 
 
 def stride_two(kernel: Array) -> Array:

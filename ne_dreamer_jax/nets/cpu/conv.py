@@ -21,6 +21,7 @@ import numpy as np
 
 from ne_dreamer_jax.nets.blocks import NORM_EPSILON
 from ne_dreamer_jax.nets.cpu import winograd
+from ne_dreamer_jax.nets.pixels import centred
 from ne_dreamer_jax.types import Array
 
 _CHUNK_BYTES = 2**21  # what the largest array about a chunk of images may take: a few of them fit a cache of some MB
@@ -180,10 +181,6 @@ def _norm_silu_backward(x: Array, scale: Array, g: Array) -> tuple[Array, Array]
     return inverse * (h - unit * jnp.mean(h * unit, axis=-1, keepdims=True)), jnp.sum(g * unit, axis=(0, 1, 2))
 
 
-def _images_to_float(images: Array) -> Array:
-    return images.astype(jnp.float32) / 255.0 - 0.5 if images.dtype == jnp.uint8 else images
-
-
 def _split(x: Array, bytes_per_image: int) -> Array:
     """``[N, ...]`` to ``[chunks, n, ...]``, padded with zeros by less than the number of chunks."""
     chunks = -(-x.shape[0] // max(1, _CHUNK_BYTES // bytes_per_image))
@@ -211,7 +208,7 @@ def _stage_forward(x: Array, scale: Array | None, kernel: Array, bias: Array) ->
     u = lowering.prepare(kernel)
 
     def body(chunk: Array) -> tuple[Array, Array]:
-        chunk = _images_to_float(chunk) if scale is None else norm_silu(chunk, scale)
+        chunk = centred(chunk) if scale is None else norm_silu(chunk, scale)
         top, which = lowering.forward(chunk, u)
         return top + bias[None, None, None], which
 
@@ -226,7 +223,7 @@ def _stage_backward(residuals: Any, g: Array) -> Any:
 
     def body(total: Any, chunk: tuple[Array, Array, Array]) -> Any:
         x, which, g = chunk
-        active = _images_to_float(x) if scale is None else norm_silu(x, scale)
+        active = centred(x) if scale is None else norm_silu(x, scale)
         dx, du = lowering.backward(active, u, which, g)
         dscale = None
         if scale is not None:
