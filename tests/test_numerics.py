@@ -33,7 +33,7 @@ def described(tree):
 
 def build(method, observation):
     """A loop of a tiny agent in a probe, its configuration and the environment's spec."""
-    probe = probes.cue() if observation == "vector" else probes.as_picture(probes.cue())
+    probe = probes.cue() if observation == "vector" else probes.as_picture(probes.cue(), side=16)
     config = replace(AGENTS[method], batch_size=2)
     settings = toy.config(env_steps=200, prefill=2 * (config.batch_length + 2)).loop
     return loops.make(settings, probe.env, nedreamer.make_agent(config, probe.env.spec), 1), config, probe.env.spec

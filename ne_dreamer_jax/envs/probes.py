@@ -20,7 +20,6 @@ from ne_dreamer_jax.envs import base
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, TimeStep
 
 SPEC = EnvSpec({"vector": ArraySpec((3,), jnp.float32)}, ContinuousAction(1))
-PICTURE = EnvSpec({"image": ArraySpec((8, 8, 3), jnp.uint8)}, SPEC.action)
 
 
 class Probe(NamedTuple):
@@ -154,12 +153,16 @@ def make(
     return base.from_core(base.Core(SPEC, reset, base.restart_or_step(reset, advance), see))
 
 
-def as_picture(probe: Probe) -> Probe:
-    """The probe with an image of one colour in the vector's place, red, green and blue for its components."""
+def as_picture(probe: Probe, side: int = 8) -> Probe:
+    """The probe with an image of one colour in the vector's place, red, green and blue for its components.
+
+    Images are `side` pixels wide and high; DrQ-v2's encoder needs 15 at least.
+    """
+    image = ArraySpec((side, side, 3), jnp.uint8)
 
     def see(obs: dict[str, Array]) -> dict[str, Array]:
         colour = jnp.round(127.5 * (obs["vector"] + 1.0)).astype(jnp.uint8)
-        return {"image": jnp.broadcast_to(colour, PICTURE.observation["image"].shape)}
+        return {"image": jnp.broadcast_to(colour, image.shape)}
 
     def seen(result: tuple[base.EnvState, TimeStep]) -> tuple[base.EnvState, TimeStep]:
         state, timestep = result
@@ -167,7 +170,7 @@ def as_picture(probe: Probe) -> Probe:
 
     env = probe.env
     picture = base.Env(
-        PICTURE,
+        EnvSpec({"image": image}, SPEC.action),
         lambda key: seen(env.reset(key)),
         lambda state, action: seen(env.step(state, action)),
         lambda state: see(env.observe(state)),

@@ -47,9 +47,11 @@ def test_a_probe_is_an_environment(name):
     conformance.check(probes.PROBES[name]().env, jax.random.key(0))
 
 
-def test_a_picture_shows_what_the_vector_says():
+@pytest.mark.parametrize("side", [8, 16])
+def test_a_picture_shows_what_the_vector_says(side):
     probe = probes.target()
-    picture = probes.as_picture(probe).env
+    picture = probes.as_picture(probe, side).env
+    assert picture.spec.observation["image"].shape == (side, side, 3)
     conformance.check(picture, jax.random.key(0))
     step = probe.env.reset(jax.random.key(0))[1], picture.reset(jax.random.key(0))[1]
     colour = np.asarray(step[1].obs["image"])

@@ -20,7 +20,10 @@ from tests.experiments import toy
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-ENVS = {"cue": lambda: probes.cue(delay=2).env, "picture": lambda: probes.as_picture(probes.cue(delay=2)).env}
+ENVS = {
+    "cue": lambda: probes.cue(delay=2).env,
+    "picture": lambda: probes.as_picture(probes.cue(delay=2), side=16).env,
+}
 METHODS = [name for name in names.METHODS if "/" not in name]
 PHASES = {
     "prefill": 3,
