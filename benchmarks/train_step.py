@@ -24,7 +24,7 @@ from ne_dreamer_jax.system.quiet import quiet
 @click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
 @click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
-@click.option("--actions", type=click.IntRange(1), default=6, show_default=True, help="Size of the continuous action.")
+@click.option("--task", help="Whose observations and actions. Default: the preset's.")
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
 @click.option("--parts/--no-parts", default=True, show_default=True, help="Whether to time the parts too.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
@@ -32,23 +32,22 @@ def main(
     preset: str,
     size: str | None,
     method: str,
-    actions: int,
+    task: str | None,
     rounds: int,
     parts: bool,
     assignments: tuple[str, ...],
 ) -> None:
-    """Time the update of a preset's agent on its frames (drqv2 in the paper's: 84x84x3), in seconds and GEMM units."""
+    """Time the update of a preset's agent on what its task shows, in seconds and GEMM units."""
     quiet()
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.agents.dreamer.agent import AgentConfig, parameter_counts
     from ne_dreamer_jax.config import PRESETS
+    from ne_dreamer_jax.envs import config as envs
     from ne_dreamer_jax.replay import ring as replay
-    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
     with refusing(ValueError):
-        run = configure(size, method, assignments, preset)
-        config, side = run.agent, run.env.image_size
-        spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
+        run = configure(size, method, assignments, preset, task)
+        config, spec = run.agent, envs.make(run.env).spec
         agent = make_agent(config, spec)
     state = agent.init(jax.random.key(0))
     batch = jax.jit(lambda key: replay.random_batch(spec, config, key))(jax.random.key(1))
@@ -73,6 +72,8 @@ def main(
             "preset": preset,
             "size": size or PRESETS[preset][1],
             "method": method,
+            "task": run.env.task,
+            "set": " ".join(assignments),
             "batch_size": config.batch_size,
             "batch_length": config.batch_length,
             "compute_dtype": getattr(config, "compute_dtype", "float32"),
@@ -83,11 +84,17 @@ def main(
     )
 
 
-def configure(size: str | None, method: str, assignments: tuple[str, ...], preset: str = "dmc") -> Any:
+def configure(
+    size: str | None,
+    method: str,
+    assignments: tuple[str, ...],
+    preset: str = "dmc",
+    task: str | None = None,
+) -> Any:
     """The config of a size and method with settings changed. Raises ValueError as the training command does."""
     from experiments.train import configure as configure_run
 
-    return configure_run(preset, size, method, {}, assignments)
+    return configure_run(preset, size, method, {"env.task": task}, assignments)
 
 
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:
@@ -135,7 +142,8 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
         noise = behavior.imagination_noise(nets, key, start.deter.shape[0], config.behavior.horizon)
         return behavior.imagine(nets, p, noise, start, lambda state: state[:, 0])
 
-    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.latent)
+    replayed = behavior.Replayed.of(rollout, config.behavior.imagine_last)
+    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), replayed.latent)
     compiled = {
         "encoder": (jax.grad(encoder), (params,)),
         "observe": (jax.grad(posterior_scan, (0, 1)), (params, rollout.embedding)),

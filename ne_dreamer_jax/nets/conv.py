@@ -3,7 +3,7 @@
 On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
 on a CPU, their gradients most of all and in bfloat16 inside of loops (twenty times float32's). There the work goes to
 `cpu_conv`: the same functions and gradients as matrix products over a few images at a time, in float32 whatever the
-dtype.
+dtype. (Patches are one matrix product as they are, see `embed_patches`.)
 
 On a mesh of CPU devices each takes its share of the images: the loop over chunks of a global array would otherwise run
 whole on every device.
@@ -96,7 +96,8 @@ def encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.float
         )
     if on_cpu() and all(cpu_conv.encodes(stage.kernel) for stage in stages):
         encode = parallel.per_shard(cpu_conv.encode_images, (parallel.SPLIT, parallel.WHOLE), parallel.SPLIT)
-        return encode(images, stages).astype(dtype)
+        pixels = images if images.dtype == jnp.uint8 else images.astype(jnp.float32)
+        return encode(pixels, stages).astype(dtype)
     return lax_encode_images(images, stages, dtype)
 
 
@@ -104,12 +105,15 @@ def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Arra
     """Each p x p patch of pixels to a vector: ``[N, H, W, C]`` to ``[N, H / p, W / p, C_out]`` of ``dtype``.
 
     A convolution of stride p with the stage's kernel ``[p, p, C, C_out]`` and bias, an RMSNorm over channels in float32
-    and SiLU: one matrix product. Images as `encode_images` takes them. Raises ValueError where p does not divide the
-    sides.
+    and SiLU: one matrix product, in ``dtype`` on every platform. Images as `encode_images` takes them. Raises
+    ValueError for images and kernels that don't fit, and where p does not divide the sides.
     """
-    p, C_out = stage.kernel.shape[0], stage.kernel.shape[3]
-    if any(side % p for side in images.shape[1:3]):
-        raise ValueError(f"Expected sides that are multiples of the patches' {p}, got {list(images.shape)}.")
+    p, _, C, C_out = stage.kernel.shape
+    if images.ndim != 4 or images.shape[-1] != C or stage.kernel.shape[1] != p or any(x % p for x in images.shape[1:3]):
+        raise ValueError(
+            f"Expected images [N, H, W, C] with H and W multiples of p and a kernel [p, p, C, C_out], got "
+            f"{list(images.shape)} and {list(stage.kernel.shape)}. Resize the images or use other patches."
+        )
     x = space_to_depth(centred(images).astype(dtype), p)
     x = x @ stage.kernel.reshape(-1, C_out).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
     return jax.nn.silu(rms_norm(x, stage.scale))

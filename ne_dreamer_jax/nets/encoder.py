@@ -25,13 +25,13 @@ class EncoderConfig:
     depth: Width = 16
     """Channels of a stage are depth times its multiplier."""
     multipliers: tuple[Width, ...] = (2, 3, 4, 4)
-    """One convolution stage, which halves the sides, for each entry."""
+    """One convolution stage, which halves the sides, for each entry; but see `patch`."""
     kernel: Annotated[int, Range(1, 1_000)] = 5
     """Side of the convolution kernels."""
     patch: Annotated[int, Range(2, 4_096)] | None = None
-    """The first stage maps squares of so many pixels a side, which do not overlap, to vectors (a convolution of that
-    stride, and no pool; DreamerV3 has none such): a fraction of the work where sides are 32 pixels. None: it is a
-    convolution as the others are."""
+    """The first stage maps squares of so many pixels a side, which do not overlap, to vectors: a convolution with that
+    kernel and stride, and no pool (DreamerV3 has none such). The decoder ends likewise. None: the first stage is a
+    convolution as the others are. benchmarks/README.md has the time of both."""
     layers: Annotated[int, Range(1, 1_000)] = 3
     """Layers of the multilayer perceptron for vectors."""
     units: Width = 256
@@ -71,16 +71,19 @@ def split_observation(observation: Mapping[str, ArraySpec]) -> tuple[list[str], 
 
 
 def embedding_size(config: EncoderConfig, observation: Mapping[str, ArraySpec]) -> int:
-    """E, the size of an embedding. Raises ValueError where an image's sides can't be halved often enough."""
+    """E, the size of an embedding. Raises ValueError where an image's sides are not multiples of `config.factor`."""
     images, vectors = split_observation(observation)
     size = config.units if vectors else 0
     if images:
         shapes = {observation[name].shape[:2] for name in images}
         factor = config.factor
         if len(shapes) > 1 or any(side % factor for side in next(iter(shapes))):
+            halved = len(config.multipliers) - (config.patch is not None)
             raise ValueError(
-                f"Images: expected one common height and width, each a multiple of {factor}, got "
-                f"{ {name: list(observation[name].shape) for name in images} }. Resize them in the environment."
+                f"Images: expected one common height and width, each a multiple of {factor} (halved {halved} times"
+                f"{'' if config.patch is None else f' after patches of {config.patch}'}), got "
+                f"{ {name: list(observation[name].shape) for name in images} }. Resize them in the environment, or "
+                "change encoder.multipliers or encoder.patch."
             )
         height, width = next(iter(shapes))
         size += (height // factor) * (width // factor) * config.depth * config.multipliers[-1]
@@ -122,7 +125,8 @@ class Encoder(nn.Module):
         stages = []
         for i, multiplier in enumerate(self.config.multipliers):
             out = self.config.depth * multiplier
-            side = self.config.patch or self.config.kernel if i == 0 else self.config.kernel
+            patches = i == 0 and self.config.patch is not None
+            side = self.config.patch if patches else self.config.kernel
             shape = (side, side, channels, out)
             stages.append(
                 conv.Stage(

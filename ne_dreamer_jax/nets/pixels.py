@@ -25,6 +25,5 @@ def space_to_depth(x: Array, side: int) -> Array:
 
 def depth_to_space(x: Array, side: int) -> Array:
     """``[N, h, w, side * side * C]`` to ``[N, h * side, w * side, C]``: each vector becomes a square of pixels."""
-    N, h, w, size = x.shape
-    C = size // side**2
-    return x.reshape(N, h, w, side, side, C).transpose(0, 1, 3, 2, 4, 5).reshape(N, h * side, w * side, C)
+    N, h, w, _ = x.shape
+    return x.reshape(N, h, w, side, side, -1).transpose(0, 1, 3, 2, 4, 5).reshape(N, h * side, w * side, -1)

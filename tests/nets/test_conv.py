@@ -186,5 +186,5 @@ def test_messages_say_what_was_expected():
         conv.conv2d(jnp.zeros((1, 4, 4, 3)), jnp.zeros((5, 5, 4, 2)))
     with pytest.raises(ValueError, match=r"multiples of 4.*\[1, 6, 8, 3\]"):
         conv.encode_images(jnp.zeros((1, 6, 8, 3)), _stages((3, 4, 6)))
-    with pytest.raises(ValueError, match=r"multiples of the patches' 4, got \[1, 6, 8, 3\]"):
+    with pytest.raises(ValueError, match=r"multiples of p and a kernel .*got \[1, 6, 8, 3\] and \[4, 4, 3, 4\]"):
         conv.embed_patches(jnp.zeros((1, 6, 8, 3)), _stages((3, 4), 4)[0])

@@ -20,6 +20,7 @@ OBSERVATION = {
     "joints": ArraySpec((3,), jnp.float32),
 }
 ENCODER = replace(tiny.CONFIG.encoder, depth=2, multipliers=(2, 4))
+PATCHES = replace(ENCODER, patch=2)
 
 
 def make(observation, blocks=4, dtype=jnp.float32, encoder=ENCODER):
@@ -27,9 +28,10 @@ def make(observation, blocks=4, dtype=jnp.float32, encoder=ENCODER):
     return decoder, tiny.fill(jax.eval_shape(decoder.init, jax.random.key(0), tiny.latent((1,))))
 
 
+@pytest.mark.parametrize("encoder", [ENCODER, PATCHES])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
-def test_every_observation_is_decoded_in_its_shape(dtype):
-    decoder, params = make(OBSERVATION, dtype=dtype)
+def test_every_observation_is_decoded_in_its_shape(dtype, encoder):
+    decoder, params = make(OBSERVATION, dtype=dtype, encoder=encoder)
     decoded = jax.jit(decoder.apply)(params, tiny.latent((2, 5)))
     shapes = {name: (2, 5, *(spec.shape or (1,))) for name, spec in OBSERVATION.items()}
     assert {name: x.shape for name, x in decoded.items()} == shapes
@@ -39,12 +41,13 @@ def test_every_observation_is_decoded_in_its_shape(dtype):
     assert np.abs(decoded["joints"]).max() > 1  # unbounded
 
 
-def test_patches_are_decoded_where_patches_are_encoded():
-    decoder, params = make(OBSERVATION, encoder=replace(ENCODER, multipliers=(4,), patch=4))
-    decoded = jax.jit(decoder.apply)(params, tiny.latent((2, 5)))
-    assert {name: x.shape for name, x in decoded.items()} == {
-        name: (2, 5, *(spec.shape or (1,))) for name, spec in OBSERVATION.items()
-    }
+def test_each_patch_is_decoded_from_a_place_of_its_own():
+    decoder, params = make({"front": OBSERVATION["front"]}, encoder=PATCHES)
+    run = jax.jit(lambda params: decoder.apply({"params": params}, tiny.latent((1,)))["front"][0])
+    rng = np.random.default_rng(0)
+    weights = {**params["params"], "stage0": {"kernel": jnp.zeros((4, 12)), "bias": jnp.asarray(rng.normal(size=12))}}
+    patch = 1 / (1 + np.exp(-np.asarray(weights["stage0"]["bias"]).reshape(2, 2, 3)))
+    np.testing.assert_allclose(run(weights), np.tile(patch, (4, 6, 1)), rtol=1e-5)
 
 
 def test_a_latent_is_decoded_by_itself():

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ne_dreamer_jax.nets import conv
 from ne_dreamer_jax.nets.encoder import Encoder, EncoderConfig, embedding_size, split_observation
 from ne_dreamer_jax.types import ArraySpec
 from tests import tiny
@@ -53,10 +54,13 @@ def test_no_observation_is_refused():
         split_observation({})
 
 
+@pytest.mark.parametrize(
+    ("config", "message"), [(CONFIG, "4 .halved 2 times."), (PATCHES, "8 .halved 1 times after patches of 4.")]
+)
 @pytest.mark.parametrize("shapes", [[(10, 8, 3)], [(8, 8, 3), (16, 16, 3)]])
-def test_images_that_do_not_halve_or_agree_are_refused(shapes):
-    with pytest.raises(ValueError, match="one common height and width, each a multiple of 4, got"):
-        embedding_size(CONFIG, {f"image{i}": ArraySpec(s, jnp.uint8) for i, s in enumerate(shapes)})
+def test_images_that_do_not_halve_or_agree_are_refused(shapes, config, message):
+    with pytest.raises(ValueError, match=f"one common height and width, each a multiple of {message}, got"):
+        embedding_size(config, {f"image{i}": ArraySpec(s, jnp.uint8) for i, s in enumerate(shapes)})
 
 
 @pytest.mark.parametrize("config", [CONFIG, PATCHES, replace(PATCHES, multipliers=(2,))])
@@ -85,6 +89,27 @@ def test_every_row_and_every_observation_counts_and_leading_axes_do_not(config):
         changed = np.any(other != got, axis=-1)
         assert changed[1, 2]
         assert changed.sum() == 1
+
+
+@pytest.mark.usefixtures("quick_compilation")
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.bfloat16, 0.05)])
+def test_patches_come_before_the_convolutions(dtype, tolerance):
+    """Embedding and gradient, with the kernel that a CPU has a lowering for, beside XLA's own convolutions."""
+    observation = {"wide": OBS["wide"]}
+    encoder = Encoder(replace(PATCHES, kernel=5), observation, dtype)
+    obs = observations(observation, (6,))
+    params = tiny.fill(jax.eval_shape(encoder.init, jax.random.key(0), obs))["params"]
+
+    def reference(params):
+        stage = lambda i: conv.Stage(*(params[f"stage{i}_{part}"] for part in ("kernel", "bias", "scale")))
+        x = conv.embed_patches(obs["wide"], stage(0))
+        return conv.lax_encode_images(x, [stage(1)]).reshape(6, -1)
+
+    encode = lambda params: encoder.apply({"params": params}, obs)
+    for function in (lambda f: f, lambda f: jax.grad(lambda params: jnp.sum(jnp.sin(f(params))))):
+        got, wanted = (jax.jit(function(f))(params) for f in (encode, reference))
+        got, wanted = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)]) for tree in (got, wanted))
+        np.testing.assert_allclose(got, wanted, atol=tolerance * np.abs(wanted).max())
 
 
 def test_vectors_pass_a_symlog():
