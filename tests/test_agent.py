@@ -354,6 +354,8 @@ def test_initialisation_makes_what_it_announces(spec):
         assert tiny.is_zero(state.params[name]["out"]) == zero
     assert tiny.is_zero((state.return_scale, state.update))
     assert_same(agent.init(jax.random.key(0)), state)
+    within = jax.jit(lambda key: agent.init(key).params)(jax.random.key(0))  # compiled with other options
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), within, state.params)
     other = agent.init(jax.random.key(1))
     assert np.any(other.params["actor"]["out"]["kernel"] != state.params["actor"]["out"]["kernel"])
 

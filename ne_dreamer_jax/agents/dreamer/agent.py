@@ -26,6 +26,7 @@ from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.settings import names, ranges
 from ne_dreamer_jax.settings.ranges import Count, NonNegative, Range
+from ne_dreamer_jax.system.compilation import jit_to_run_once
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import (
     Array,
@@ -200,7 +201,7 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         )
 
     return Agent(
-        init=jax.jit(in_32_bits(init)),
+        init=jit_to_run_once(in_32_bits(init)),
         init_policy=in_32_bits(init_policy),
         act=jax.jit(in_32_bits(act), static_argnames="mode"),
         train_step=jax.jit(in_32_bits(train_step), donate_argnums=0),

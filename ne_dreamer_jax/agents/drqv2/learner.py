@@ -14,6 +14,7 @@ from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.drqv2.config import DrQv2Config
 from ne_dreamer_jax.agents.drqv2.networks import Networks
 from ne_dreamer_jax.agents.drqv2.transitions import Transitions, n_step, random_shift
+from ne_dreamer_jax.system.compilation import jit_to_run_once
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, Batch, EnvSpec, Latent, Metrics, Params, TimeStep
 
@@ -157,7 +158,7 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
         return optax.apply_updates(params, updates), optimizer
 
     return (
-        jax.jit(in_32_bits(init)),
+        jit_to_run_once(in_32_bits(init)),
         in_32_bits(init_policy),
         jax.jit(in_32_bits(act), static_argnames="mode"),
         jax.jit(in_32_bits(train_step), donate_argnums=0),
