@@ -49,7 +49,7 @@ def test_presets_build_at_every_size_and_survive_json(name):
         config = configs.preset(name, size)
         assert settings.from_dict(Config, json.loads(json.dumps(settings.to_dict(config)))) == config
         if size is not None:
-            share = 2 if name == "rooms_small" else 1
+            share = 2 if name in ("rooms_small", "laptop", "quickstart") else 1
             assert config.agent.rssm.deter == configs.SIZES[size]["deter"] // share
             assert config.agent.heads.units == config.agent.encoder.units == configs.SIZES[size]["units"]
     config = configs.preset(name)
