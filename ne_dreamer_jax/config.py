@@ -97,13 +97,13 @@ def _small_agent(size: str) -> AgentConfig:
 
 
 def laptop(size: str) -> Config:
-    """For an hour of a CPU core, from pixels or vectors: as little arithmetic in an update as learning does with.
+    """For an hour of a CPU core, from pixels or vectors: little arithmetic in an update.
 
     Half the recurrent state; frames of 32 x 32, encoded in patches of 4 x 4 and by one convolution; a small predictor.
     Behaviour is learned from the last four steps of each sequence alone, for which the policy's gradient comes through
     the world model. The learning rate is 25 times the paper's, and returns are divided by as little as 0.1, not 1:
-    first rewards are often hundredths, and would teach the actor nothing beside its entropy. An hour is some 30,000
-    updates; experiments/RESULTS.md says what they reach, and what else was tried.
+    first rewards are often hundredths, and would teach the actor nothing beside its entropy. experiments/RESULTS.md
+    says what its first ten to twenty minutes reach, and what else was tried.
     """
     small = _small_agent(size)
     agent = replace(
@@ -121,7 +121,7 @@ def laptop(size: str) -> Config:
 
 
 def quickstart(size: str) -> Config:
-    """Solves a task from pixels in a quarter of an hour on two CPU cores: `laptop`, with a ball to catch in a cup."""
+    """Solves a task from pixels in some twenty minutes of a CPU core: `laptop`, with a ball to catch in a cup."""
     long = laptop(size)
     return replace(
         long, env=replace(long.env, task="dmc/ball_in_cup_catch"), loop=replace(long.loop, env_steps=120_000)

@@ -156,7 +156,7 @@ def make(
 def as_picture(probe: Probe, side: int = 8) -> Probe:
     """The probe with an image of one colour in the vector's place, red, green and blue for its components.
 
-    Images are `side` pixels wide and high; DrQ-v2's encoder needs 15 at least.
+    Images are ``side`` pixels wide and high.
     """
     image = ArraySpec((side, side, 3), jnp.uint8)
 

@@ -31,7 +31,7 @@ class EncoderConfig:
     patch: Annotated[int, Range(2, 4_096)] | None = None
     """The first stage maps squares of so many pixels a side, which do not overlap, to vectors: a convolution with that
     kernel and stride, and no pool (DreamerV3 has none such). The decoder ends likewise. None: the first stage is a
-    convolution as the others are. benchmarks/README.md has the time of both."""
+    convolution as the others are."""
     layers: Annotated[int, Range(1, 1_000)] = 3
     """Layers of the multilayer perceptron for vectors."""
     units: Width = 256
