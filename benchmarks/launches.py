@@ -82,7 +82,7 @@ def main(size: str, method: str, target: str, actions: int, task: str | None, as
     from benchmarks.train_step import configure
 
     with refusing(ValueError):
-        config = configure(size, method, (*assignments, *([f"env.task={task}"] if task else [])))
+        config = configure(size, method, assignments, task=task)
         compiled = compile_step(config, target) if task else compile_update(config, actions, target)
     found = parts(compiled.as_text())
     rows: list[Mapping[str, Any]] = [

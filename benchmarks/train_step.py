@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
-from ne_dreamer_jax.commands.options import Name, refusing
+from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
@@ -24,7 +24,7 @@ from ne_dreamer_jax.system.quiet import quiet
 @click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
 @click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
-@click.option("--task", help="Whose observations and actions. Default: the preset's.")
+@click.option("--task", type=Task(), help="Whose observations and actions. Default: the preset's.")
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
 @click.option("--parts/--no-parts", default=True, show_default=True, help="Whether to time the parts too.")
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
@@ -46,7 +46,7 @@ def main(
     from ne_dreamer_jax.replay import ring as replay
 
     with refusing(ValueError):
-        run = configure(size, method, assignments, preset, task)
+        run = configure(size, method, assignments, preset=preset, task=task)
         config, spec = run.agent, envs.make(run.env).spec
         agent = make_agent(config, spec)
     state = agent.init(jax.random.key(0))
@@ -88,6 +88,7 @@ def configure(
     size: str | None,
     method: str,
     assignments: tuple[str, ...],
+    *,
     preset: str = "dmc",
     task: str | None = None,
 ) -> Any:

@@ -1,7 +1,7 @@
 """A training chunk of the quickstart in several checkouts of this repository, timed in turns on one machine.
 
-Each checkout has a process of its own, which compiles the chunk and then waits; they take turns, so that what else the
-machine does falls on all of them alike.
+Each checkout trains by its own quickstart, so that the programs differ where presets do. It has a process of its own,
+which compiles the chunk and then waits; they take turns, so that what else the machine does falls on all of them alike.
 
 Usage: ``git worktree add ../before HEAD~10; python -m benchmarks.versions ../before .``
 """
@@ -41,7 +41,7 @@ for _ in sys.stdin:
 @click.argument("checkouts", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--rounds", type=click.IntRange(1), default=20, help="Chunks timed of each.")
 def main(checkouts: tuple[Path, ...], rounds: int) -> None:
-    """Prints milliseconds of a chunk of 8 vector steps and 24 updates, and its ratio to the first checkout's."""
+    """Prints milliseconds of a chunk of 8 vector steps, updates included, and its ratio to the first checkout's."""
     command = [sys.executable, "-W", "ignore", "-c", WORKER]
     workers = [
         subprocess.Popen([*command, str(path.resolve())], stdin=-1, stdout=-1, text=True, cwd=path)

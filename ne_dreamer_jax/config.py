@@ -86,11 +86,13 @@ def rooms(size: str) -> Config:
     return Config(RoomsConfig(), agent_config(size), loop)
 
 
-def _small_agent(size: str) -> AgentConfig:
-    """What the agents for a CPU share: sequences of 16 steps and a smaller predictor."""
+def _small_agent(size: str, predictor_width: int) -> AgentConfig:
+    """What the agents for a CPU share: half the recurrent state, sequences of 16 steps and a predictor of one layer."""
+    base = agent_config(size)
     return replace(
-        agent_config(size),
-        objective=NextEmbedding(PredictorConfig(layers=1, width=128, feedforward=256)),
+        base,
+        rssm=replace(base.rssm, deter=base.rssm.deter // 2),
+        objective=NextEmbedding(PredictorConfig(layers=1, width=predictor_width, feedforward=2 * predictor_width)),
         batch_size=16,
         batch_length=16,
     )
@@ -105,12 +107,10 @@ def laptop(size: str) -> Config:
     first rewards are often hundredths, and would teach the actor nothing beside its entropy. experiments/RESULTS.md
     says what its first ten to twenty minutes reach, and what else was tried.
     """
-    small = _small_agent(size)
+    small = _small_agent(size, predictor_width=64)
     agent = replace(
         small,
         encoder=replace(small.encoder, patch=4, multipliers=(4, 4)),
-        rssm=replace(small.rssm, deter=small.rssm.deter // 2),
-        objective=NextEmbedding(PredictorConfig(layers=1, width=64, feedforward=128)),
         behavior=BehaviorConfig(
             horizon=10, imagine_last=4, discount=0.99, entropy=3e-3, gradient="dynamics", return_floor=0.1
         ),
@@ -122,9 +122,9 @@ def laptop(size: str) -> Config:
 
 def quickstart(size: str) -> Config:
     """Solves a task from pixels in some twenty minutes of a CPU core: `laptop`, with a ball to catch in a cup."""
-    long = laptop(size)
+    base = laptop(size)
     return replace(
-        long, env=replace(long.env, task="dmc/ball_in_cup_catch"), loop=replace(long.loop, env_steps=120_000)
+        base, env=replace(base.env, task="dmc/ball_in_cup_catch"), loop=replace(base.loop, env_steps=120_000)
     )
 
 
@@ -134,11 +134,10 @@ def rooms_small(size: str) -> Config:
     Frames of 24 x 24 are halved three times. A trial of the task takes some nine steps, so that most of the sequences
     of 16 hold what is to be remembered and what comes of it; returns are in tens, and need no smaller floor than 1.
     """
-    small = _small_agent(size)
+    small = _small_agent(size, predictor_width=128)
     agent = replace(
         small,
         encoder=replace(small.encoder, multipliers=(2, 3, 4)),
-        rssm=replace(small.rssm, deter=small.rssm.deter // 2),
         behavior=BehaviorConfig(horizon=8, discount=0.98, entropy=1e-3),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
     )

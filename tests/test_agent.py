@@ -261,7 +261,7 @@ def test_configs_that_do_not_fit_are_refused_when_the_agent_is_made(change, mess
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        ({"image": ArraySpec((9, 8, 3), jnp.uint8)}, "each a multiple of 4 .halved 2 times., got"),
+        ({"image": ArraySpec((9, 8, 3), jnp.uint8)}, "multiples of 4 = 2..2, got"),
         ({"image": ArraySpec((8, 8, 3), jnp.float32)}, "expected a uint8 image"),
         ({}, "at least one observation"),
     ],

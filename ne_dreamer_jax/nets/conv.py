@@ -108,14 +108,14 @@ def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Arra
     and SiLU: one matrix product, in ``dtype`` on every platform. Images as `encode_images` takes them. Raises
     ValueError for images and kernels that don't fit, and where p does not divide the sides.
     """
-    p, _, C, C_out = stage.kernel.shape
-    if images.ndim != 4 or images.shape[-1] != C or stage.kernel.shape[1] != p or any(x % p for x in images.shape[1:3]):
-        raise ValueError(
-            f"Expected images [N, H, W, C] with H and W multiples of p and a kernel [p, p, C, C_out], got "
-            f"{list(images.shape)} and {list(stage.kernel.shape)}. Resize the images or use other patches."
-        )
+    kernel, shapes = stage.kernel, f"got {list(images.shape)} and {list(stage.kernel.shape)}"
+    p = kernel.shape[0]
+    if images.ndim != 4 or kernel.ndim != 4 or kernel.shape[1:3] != (p, images.shape[-1]):
+        raise ValueError(f"Expected images [N, H, W, C] and a kernel [p, p, C, C_out], {shapes}.")
+    if any(side % p for side in images.shape[1:3]):
+        raise ValueError(f"Expected images whose sides are multiples of {p}, the kernel's, {shapes}.")
     x = space_to_depth(centred(images).astype(dtype), p)
-    x = x @ stage.kernel.reshape(-1, C_out).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
+    x = x @ kernel.reshape(-1, kernel.shape[-1]).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
     return jax.nn.silu(rms_norm(x, stage.scale))
 
 

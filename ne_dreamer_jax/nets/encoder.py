@@ -25,13 +25,13 @@ class EncoderConfig:
     depth: Width = 16
     """Channels of a stage are depth times its multiplier."""
     multipliers: tuple[Width, ...] = (2, 3, 4, 4)
-    """One convolution stage, which halves the sides, for each entry; but see `patch`."""
+    """Channel multipliers, one for each stage. A stage is a convolution that halves the sides; with `patch`, the first
+    one embeds patches instead."""
     kernel: Annotated[int, Range(1, 1_000)] = 5
-    """Side of the convolution kernels."""
+    """Side of the convolution kernels (but for that of patches)."""
     patch: Annotated[int, Range(2, 4_096)] | None = None
-    """The first stage maps squares of so many pixels a side, which do not overlap, to vectors: a convolution with that
-    kernel and stride, and no pool (DreamerV3 has none such). The decoder ends likewise. None: the first stage is a
-    convolution as the others are."""
+    """Side p of the patches. The first stage is then a convolution with a p x p kernel, stride p and no pooling, and
+    the decoder's last layer predicts p x p patches. DreamerV3 has no such stage. None: all stages are alike."""
     layers: Annotated[int, Range(1, 1_000)] = 3
     """Layers of the multilayer perceptron for vectors."""
     units: Width = 256
@@ -45,8 +45,8 @@ class EncoderConfig:
     @property
     def factor(self) -> int:
         """By which an image's sides are divided."""
-        halved = len(self.multipliers)
-        return 2**halved if self.patch is None else self.patch * 2 ** (halved - 1)
+        stages = len(self.multipliers)
+        return 2**stages if self.patch is None else self.patch * 2 ** (stages - 1)
 
 
 def split_observation(observation: Mapping[str, ArraySpec]) -> tuple[list[str], list[str]]:
@@ -76,16 +76,19 @@ def embedding_size(config: EncoderConfig, observation: Mapping[str, ArraySpec]) 
     size = config.units if vectors else 0
     if images:
         shapes = {observation[name].shape[:2] for name in images}
-        factor = config.factor
-        if len(shapes) > 1 or any(side % factor for side in next(iter(shapes))):
-            halved = len(config.multipliers) - (config.patch is not None)
+        factor, found = config.factor, {name: list(observation[name].shape) for name in images}
+        if len(shapes) > 1:
             raise ValueError(
-                f"Images: expected one common height and width, each a multiple of {factor} (halved {halved} times"
-                f"{'' if config.patch is None else f' after patches of {config.patch}'}), got "
-                f"{ {name: list(observation[name].shape) for name in images} }. Resize them in the environment, or "
-                "change encoder.multipliers or encoder.patch."
+                f"Images: expected one common height and width, got {found}. Resize them in the environment."
             )
         height, width = next(iter(shapes))
+        if height % factor or width % factor:
+            stages = len(config.multipliers)
+            made_of = f"2**{stages}" if config.patch is None else f"{config.patch} * 2**{stages - 1}"
+            raise ValueError(
+                f"Images: expected a height and width that are multiples of {factor} = {made_of}, got {found}. Resize "
+                "them in the environment, or change encoder.multipliers or encoder.patch."
+            )
         size += (height // factor) * (width // factor) * config.depth * config.multipliers[-1]
     return size
 

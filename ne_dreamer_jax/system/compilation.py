@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_LITTLE_OPTIMISED = {"xla_backend_optimization_level": 1}
+LITTLE_OPTIMISED = {"xla_backend_optimization_level": 1}
 
 
 def jit_to_run_once(function: Callable[P, R]) -> Callable[P, R]:
-    """``jax.jit`` for what runs once: compiled sooner, to machine code that is optimised less.
+    """``jax.jit`` for a function that runs once: it compiles sooner, to less optimised machine code.
 
-    The result is the same but for rounding. Within another program, whose own options count, it is a plain ``jax.jit``.
+    Called while another function is traced or under ``jax.vmap``, it is a plain ``jax.jit``, as compiler options count
+    for whole programs. The result is the same up to rounding.
     """
-    alone, within = jax.jit(function, compiler_options=_LITTLE_OPTIMISED), jax.jit(function)
+    alone, within = jax.jit(function, compiler_options=LITTLE_OPTIMISED), jax.jit(function)
 
     @functools.wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> R:
-        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((args, options)))
-        return (within if traced else alone)(*args, **options)
+        return (within if _is_traced((args, options)) else alone)(*args, **options)
 
     return call
+
+
+def _is_traced(arguments: Any) -> bool:
+    """Whether a function called with these arguments becomes part of another program.
+
+    New arrays are tracers while a function is traced, whatever its arguments are; under ``vmap`` only arguments are.
+    """
+    return any(isinstance(x, jax.core.Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(arguments)))

@@ -186,5 +186,9 @@ def test_messages_say_what_was_expected():
         conv.conv2d(jnp.zeros((1, 4, 4, 3)), jnp.zeros((5, 5, 4, 2)))
     with pytest.raises(ValueError, match=r"multiples of 4.*\[1, 6, 8, 3\]"):
         conv.encode_images(jnp.zeros((1, 6, 8, 3)), _stages((3, 4, 6)))
-    with pytest.raises(ValueError, match=r"multiples of p and a kernel .*got \[1, 6, 8, 3\] and \[4, 4, 3, 4\]"):
-        conv.embed_patches(jnp.zeros((1, 6, 8, 3)), _stages((3, 4), 4)[0])
+    stage = _stages((3, 4), 4)[0]
+    with pytest.raises(ValueError, match=r"multiples of 4, the kernel's, got \[1, 6, 8, 3\] and \[4, 4, 3, 4\]"):
+        conv.embed_patches(jnp.zeros((1, 6, 8, 3)), stage)
+    for images, kernel in (((1, 8, 8, 2), (4, 4, 3, 4)), ((1, 8, 8, 3), (4, 3, 3, 4)), ((1, 8, 8, 3), (3, 4))):
+        with pytest.raises(ValueError, match=r"images \[N, H, W, C\] and a kernel \[p, p, C, C_out\], got"):
+            conv.embed_patches(jnp.zeros(images), stage._replace(kernel=jnp.zeros(kernel)))

@@ -43,11 +43,14 @@ def test_every_observation_is_decoded_in_its_shape(dtype, encoder):
 
 def test_each_patch_is_decoded_from_a_place_of_its_own():
     decoder, params = make({"front": OBSERVATION["front"]}, encoder=PATCHES)
-    run = jax.jit(lambda params: decoder.apply({"params": params}, tiny.latent((1,)))["front"][0])
-    rng = np.random.default_rng(0)
-    weights = {**params["params"], "stage0": {"kernel": jnp.zeros((4, 12)), "bias": jnp.asarray(rng.normal(size=12))}}
-    patch = 1 / (1 + np.exp(-np.asarray(weights["stage0"]["bias"]).reshape(2, 2, 3)))
-    np.testing.assert_allclose(run(weights), np.tile(patch, (4, 6, 1)), rtol=1e-5)
+    last = lambda module, _: module.name == "stage0"
+    decoded, kept = decoder.apply(params, tiny.latent((1,)), capture_intermediates=last, mutable="intermediates")
+    cells = np.asarray(kept["intermediates"]["stage0"]["__call__"][0])[0]
+    assert cells.shape == (4, 6, 2 * 2 * 3)
+    for row, column in np.ndindex(8, 12):
+        cell = cells[row // 2, column // 2].reshape(2, 2, 3)
+        pixel = 1 / (1 + np.exp(-cell[row % 2, column % 2]))
+        np.testing.assert_allclose(decoded["front"][0, row, column], pixel, rtol=1e-5)
 
 
 def test_a_latent_is_decoded_by_itself():

@@ -55,11 +55,15 @@ def test_no_observation_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("config", "message"), [(CONFIG, "4 .halved 2 times."), (PATCHES, "8 .halved 1 times after patches of 4.")]
+    ("config", "shapes", "message"),
+    [
+        (CONFIG, [(10, 8, 3)], r"multiples of 4 = 2\*\*2, got .*change encoder.multipliers or encoder.patch"),
+        (PATCHES, [(8, 12, 3)], r"multiples of 8 = 4 \* 2\*\*1, got"),
+        (CONFIG, [(8, 8, 3), (16, 16, 3)], r"one common height and width, got .*Resize them in the environment\.$"),
+    ],
 )
-@pytest.mark.parametrize("shapes", [[(10, 8, 3)], [(8, 8, 3), (16, 16, 3)]])
-def test_images_that_do_not_halve_or_agree_are_refused(shapes, config, message):
-    with pytest.raises(ValueError, match=f"one common height and width, each a multiple of {message}, got"):
+def test_images_that_do_not_halve_or_agree_are_refused(config, shapes, message):
+    with pytest.raises(ValueError, match=message):
         embedding_size(config, {f"image{i}": ArraySpec(s, jnp.uint8) for i, s in enumerate(shapes)})
 
 
@@ -92,7 +96,7 @@ def test_every_row_and_every_observation_counts_and_leading_axes_do_not(config):
 
 
 @pytest.mark.usefixtures("quick_compilation")
-@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.bfloat16, 0.05)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.bfloat16, 0.1)])
 def test_patches_come_before_the_convolutions(dtype, tolerance):
     """Embedding and gradient, with the kernel that a CPU has a lowering for, beside XLA's own convolutions."""
     observation = {"wide": OBS["wide"]}
@@ -108,8 +112,8 @@ def test_patches_come_before_the_convolutions(dtype, tolerance):
     encode = lambda params: encoder.apply({"params": params}, obs)
     for function in (lambda f: f, lambda f: jax.grad(lambda params: jnp.sum(jnp.sin(f(params))))):
         got, wanted = (jax.jit(function(f))(params) for f in (encode, reference))
-        got, wanted = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)]) for tree in (got, wanted))
-        np.testing.assert_allclose(got, wanted, atol=tolerance * np.abs(wanted).max())
+        close = lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance * np.abs(b).max())
+        jax.tree.map(close, got, wanted)
 
 
 def test_vectors_pass_a_symlog():
