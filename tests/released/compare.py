@@ -57,7 +57,7 @@ class Settings(types.SimpleNamespace):
         return vars(self).keys()
 
 
-def settings(config: AgentConfig, spec: EnvSpec, method: str) -> Settings:
+def settings(config: AgentConfig, method: str) -> Settings:
     """Their settings of our agent; those that say nothing at this size are as in their configuration files."""
     rssm, heads, encoder, behavior, optimizer = (
         config.rssm,
@@ -77,7 +77,7 @@ def settings(config: AgentConfig, spec: EnvSpec, method: str) -> Settings:
     decoded = head("mlp_decoder", encoder.layers, None, Settings(name="identity"), 1.0)
     decoded.units = encoder.units
     pictures = {"act": "SiLU", "norm": True, "kernel_size": encoder.kernel, "depth": encoder.depth}
-    keys = {"mlp_keys": "vector", "cnn_keys": "image"}
+    keys = {"mlp_keys": ".*", "cnn_keys": ".*"}  # vectors and pictures are told apart by their shapes
     blocks = config.objective.blocks if isinstance(config.objective, Reconstruction) else 1
     world_model = Settings(
         rssm=Settings(
@@ -181,11 +181,12 @@ def _objective(objective: Any) -> dict[str, Settings]:
 
 
 def load(checkout: Path) -> Any:
-    """Their module ``dreamer``. What it imports to log, and to store, is put aside."""
+    """Their module ``dreamer``. What it logs and stores with is put aside; what PyTorch has dropped is back."""
     for name in ("wandb", "boto3", "dotenv"):
         module = types.ModuleType(name)
         module.load_dotenv = lambda *_: None  # type: ignore[attr-defined]
         sys.modules.setdefault(name, module)
+    torch.Tensor.add_ = _old_add  # type: ignore[method-assign, assignment]
     sys.path.insert(0, str(checkout))
     import dreamer
 
@@ -303,7 +304,7 @@ def _make(dreamer: Any, config: AgentConfig, spec: EnvSpec, method: str) -> Any:
     if isinstance(spec.action, DiscreteAction):
         space.discrete = True
     with contextlib.redirect_stdout(None):
-        return dreamer.Dreamer(settings(config, spec, method), types.SimpleNamespace(spaces=shapes), space)
+        return dreamer.Dreamer(settings(config, method), types.SimpleNamespace(spaces=shapes), space)
 
 
 def _give(theirs: Any, config: AgentConfig, state: Any) -> None:
@@ -341,7 +342,6 @@ def main(checkout: Path, cases: tuple[tuple[str, str], ...], initial: bool, writ
     """Compare this package with a checkout of the authors' code."""
     torch.set_num_threads(1)
     jax.config.update("jax_disable_most_optimizations", True)  # as the tests do
-    torch.Tensor.add_ = _old_add  # type: ignore[method-assign, assignment]
     dreamer = load(checkout)
     if initial:
         for method in setting.METHODS:
