@@ -56,3 +56,15 @@ def test_in_another_program_it_is_a_plain_jit(made, within):
     draw, called = made
     assert within(draw).shape == (3,)
     assert set(called) == {None}
+
+
+def test_constants_are_computed_at_once_also_within_another_program():
+    """By one program: each operation by itself would compile for itself."""
+
+    def traced(x):
+        value = compilation.computed_now(lambda: jnp.arange(3.0) * 2)
+        assert isinstance(x, jax.core.Tracer)
+        assert not isinstance(value, jax.core.Tracer)
+        return x + value
+
+    np.testing.assert_array_equal(jax.jit(traced)(jnp.ones(3)), [1, 3, 5])

@@ -314,6 +314,7 @@ CHANGES = {
     "agent.optimizer": {
         "name": "laprop",
         "learning_rate": "1e-4",
+        "actor_rate": "0.5",
         "beta1": "0.8",
         "beta2": "0.99",
         "eps": "1e-8",
@@ -423,7 +424,7 @@ def behavior(config):
 def optimizer(config):
     """The update rule."""
     transform = optim.make(config.agent.optimizer)
-    x = {"x": jnp.ones((2, 3))}
+    x = {"actor": jnp.ones((2, 3))}
     yield program(lambda x: transform.update(x, transform.init(x), x), x)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from ne_dreamer_jax.render import camera, floor, texture
 from ne_dreamer_jax.render.rays import Vec
 from ne_dreamer_jax.render.scene import SAMPLES, Floor, Group, Headlight, Kind, Light, Scene, String
+from ne_dreamer_jax.system.compilation import computed_now
 
 _DRAWN_GROUPS = 3  # groups 0, 1 and 2 are visible by default
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
@@ -94,8 +95,8 @@ def build(model: mujoco.MjModel, camera_id: int | str, height: int = 64, width: 
     stands_still = model.cam_mode[camera_id] == _FIXED and not any(light.body for light in scene.lights)
     if scene.floor is None or not stands_still:
         return scene
-    with jax.ensure_compile_time_eval():
-        view = floor.view(scene, camera.camera_position(scene, data), camera.place_lights(scene, data))
+    place = lambda: (camera.camera_position(scene, data), camera.place_lights(scene, data))
+    view = computed_now(lambda: floor.view(scene, *place()))
     return dataclasses.replace(scene, floor_view=jax.tree.map(np.asarray, view))
 
 

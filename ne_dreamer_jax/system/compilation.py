@@ -12,7 +12,7 @@ import jax.numpy as jnp
 P = ParamSpec("P")
 R = TypeVar("R")
 
-LITTLE_OPTIMISED = {"xla_backend_optimization_level": 1}
+LITTLE_OPTIMISED: dict[str, Any] = {"xla_backend_optimization_level": 1}
 
 
 def jit_to_run_once(function: Callable[P, R]) -> Callable[P, R]:
@@ -28,6 +28,11 @@ def jit_to_run_once(function: Callable[P, R]) -> Callable[P, R]:
         return (within if _is_traced((args, options)) else alone)(*args, **options)
 
     return call
+
+
+def computed_now(function: Callable[[], R]) -> R:
+    """What a function of constants returns, by one program that runs at once, also while another function is traced."""
+    return jax.jit(function).lower().compile(LITTLE_OPTIMISED)()
 
 
 def _is_traced(arguments: Any) -> bool:

@@ -49,6 +49,21 @@ def step(env):
     return jax.jit(env.step)
 
 
+def test_a_simulation_is_traced_once():
+    core, traced = make_core(), []
+
+    def step(*args):
+        traced.append(args)
+        return core.step(*args)
+
+    env = base.from_core(core._replace(step=step))
+    keys = jax.random.split(jax.random.key(0), 3)
+    state = jax.eval_shape(jax.vmap(env.prepare), keys)
+    for _ in range(2):  # as in training and in evaluation
+        jax.eval_shape(lambda *args: jax.vmap(env.step)(*args), state, jax.ShapeDtypeStruct((3, 1), jnp.float32))
+    assert len(traced) == 1
+
+
 def act(value):
     return jnp.array([value], jnp.float32)
 

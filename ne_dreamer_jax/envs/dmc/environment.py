@@ -55,6 +55,7 @@ def make_core(task: Task, obs: str, action_repeat: int, image_size: int) -> base
     def reset(key: Array) -> State:
         return step(blank(), jnp.zeros(simulation.mj_model.nu, jnp.float32), jnp.ones((), bool), key)[0]
 
+    @jax.jit  # traced once for `reset` and for itself
     def step(state: State, action: Array, restart: Array, key: Array) -> tuple[State, base.Progress]:
         def draw() -> tuple[Start, Episode]:
             start, episode = task.reset(key)

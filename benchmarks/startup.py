@@ -1,0 +1,98 @@
+"""From the command to the first update, with an empty cache of compiled programs and again with a full one.
+
+Each checkout trains in a directory of its own until it has learned a little, twice; checkouts take turns. Processor
+seconds count what all threads did, and say more than seconds on a machine that others use.
+
+Usage: ``python -m benchmarks.startup --preset quickstart``, or ``python -m benchmarks.startup ../before .``
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+
+from ne_dreamer_jax.commands.options import Name, Task
+from ne_dreamer_jax.settings import names
+
+TRACED = re.compile(r"Traced in ([\d.]+) s, (.*) in ([\d.]+) s")
+
+
+class Start(NamedTuple):
+    """What a command took until it ended, just after its first updates."""
+
+    wall: float  # seconds
+    processor: float  # seconds of all threads
+    chunk: str  # what the command said of tracing and compiling the training chunk
+
+
+@click.command(help=__doc__, context_settings={"show_default": True, "max_content_width": 110})
+@click.argument("checkouts", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart")
+@click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
+@click.option("--task", type=Task(), help="Default: the preset's.")
+@click.option("--rounds", type=click.IntRange(1), default=3, help="Cold and warm starts of each.")
+@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
+def main(
+    checkouts: tuple[Path, ...],
+    preset: str,
+    size: str | None,
+    task: str | None,
+    rounds: int,
+    assignments: tuple[str, ...],
+) -> None:
+    """Prints seconds of a cold and of a warm start, medians over the rounds."""
+    options = ["--preset", preset, *(["--size", size] if size else []), *(["--task", task] if task else [])]
+    for assignment in (*shortest(preset, size), *assignments):
+        options += ["--set", assignment]
+    places = checkouts or (Path(),)
+    starts: dict[tuple[Path, str], list[Start]] = {}
+    for _ in range(rounds):
+        for place in places:
+            with tempfile.TemporaryDirectory() as directory:
+                for how in ("cold", "warm"):
+                    began = start(place.resolve(), options, Path(directory), how)
+                    starts.setdefault((place, how), []).append(began)
+                    click.echo(f"{place} {how}: {began.wall:.1f} s, {began.processor:.1f} of processors; {began.chunk}")
+    click.echo("medians")
+    for (place, how), found in starts.items():
+        wall, processor = (statistics.median(values) for values in zip(*(s[:2] for s in found), strict=True))
+        click.echo(f"{place} {how}: {wall:.1f} s, {processor:.1f} of processors")
+
+
+def shortest(preset: str, size: str | None) -> Sequence[str]:
+    """Settings of a run that is over after its first updates."""
+    from ne_dreamer_jax.config import preset as config_of
+
+    config = config_of(preset, size)
+    vector_step = config.loop.num_envs * config.env.action_repeat
+    prefill = -(-config.loop.prefill * config.env.action_repeat // vector_step) * vector_step
+    return f"loop.env_steps={prefill + 2 * vector_step}", "loop.eval_every=none"
+
+
+def start(checkout: Path, options: Sequence[str], directory: Path, name: str) -> Start:
+    """Trains once. Raises RuntimeError where the command fails."""
+    command = [sys.executable, "-m", "experiments.train", *options, "--logdir", str(directory / name)]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(directory), "PYTHONPATH": str(checkout)}
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise RuntimeError(f"expected training to end well, got exit code {done.returncode}: {done.stderr[-2000:]}")
+    traced = TRACED.search(done.stdout)
+    chunk = "" if traced is None else f"the chunk traced in {traced[1]} s, {traced[2]} in {traced[3]} s"
+    return Start(wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, chunk)
+
+
+if __name__ == "__main__":
+    main()
