@@ -99,6 +99,18 @@ def test_the_slow_critic_follows_at_its_rate(update):
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-7)
 
 
+def test_the_entropys_weight_changes_with_the_updates():
+    behavior = REPLACE(tiny.CONFIG.behavior, entropy=0.0, entropy_final=1e4, entropy_updates=10)
+    agent, batch = make_agent(REPLACE(tiny.CONFIG, behavior=behavior), tiny.VECTORS), tiny.batch(tiny.VECTORS)
+    state = lambda update: tiny.state(agent)._replace(update=jnp.asarray(update, jnp.int32))
+    first, half, full, later = (
+        float(agent.train_step(state(update), batch)[2]["loss/actor"]) for update in (0, 5, 10, 20)
+    )
+    assert full < first - 1e3
+    np.testing.assert_allclose(half - first, (full - first) / 2, rtol=1e-3)
+    assert later == full
+
+
 def test_losses_are_reported_by_name_and_weighed(update):
     metrics, scales = jax.device_get(update.metrics), update.agent.config.loss_scales
     assert all(x.shape == () and x.dtype == np.float32 and np.isfinite(x) for x in metrics.values())

@@ -16,7 +16,7 @@ from ne_dreamer_jax import make_agent, objectives, settings
 from ne_dreamer_jax.agents import drqv2, optim
 from ne_dreamer_jax.agents.dreamer import world_model
 from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
-from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
+from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses, entropy_scale
 from ne_dreamer_jax.commands import train
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import registry
@@ -304,6 +304,8 @@ CHANGES = {
         "discount_in_head": "false",
         "lam": "0.9",
         "entropy": "0.1",
+        "entropy_final": "0.01",
+        "entropy_updates": "7",
         "gradient": "dynamics",
         "slow_scale": "0.5",
         "return_decay": "0.9",
@@ -349,7 +351,10 @@ CHANGES = {
     },
 }
 
-TOGETHER = {"agent.objective.unshifted_token": "agent.objective.shift=0"}
+TOGETHER = {
+    "agent.objective.unshifted_token": "agent.objective.shift=0",
+    "agent.behavior.entropy_updates": "agent.behavior.entropy_final=0.01",
+}
 """Setting -> what must be set for it to mean anything."""
 
 
@@ -416,6 +421,7 @@ def behavior(config):
     nets = tiny.networks(tiny.VECTORS)
     params = jax.eval_shape(nets.init, KEY)
     rollout, scale = rollout_of(nets), ReturnScale(jnp.zeros(()), jnp.zeros(()))
+    yield program(lambda update: entropy_scale(config.agent.behavior, update), jnp.ones((), jnp.int32))
     yield program(
         lambda p: actor_critic_losses(nets, config.agent.behavior, p, p["critic"], scale, KEY, rollout), params
     )

@@ -18,7 +18,7 @@ def reinforce_loss(
     advantage: jax.Array,
     entropy: jax.Array,
     weight: jax.Array,
-    entropy_scale: float = 3e-4,
+    entropy_scale: float | jax.Array = 3e-4,
 ) -> jax.Array:
     r"""Score-function actor loss, :math:`-w_t (\mathrm{sg}(A_t) \log \pi(a_t | s_t) + \eta H[\pi(\cdot | s_t)])`.
 
@@ -47,7 +47,7 @@ def dynamics_loss(
     normalized_return: jax.Array,
     entropy: jax.Array,
     weight: jax.Array,
-    entropy_scale: float = 3e-4,
+    entropy_scale: float | jax.Array = 3e-4,
 ) -> jax.Array:
     r"""Actor loss backpropagated through the world model, :math:`-w_t (R_t / \max(1, S) + \eta H[\pi(\cdot | s_t)])`.
 

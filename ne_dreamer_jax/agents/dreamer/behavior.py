@@ -30,7 +30,7 @@ from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.nets.rssm import RSSM, feature
 from ne_dreamer_jax.settings import ranges
-from ne_dreamer_jax.settings.ranges import LARGEST, NonNegative, Positive, Range, Share, ShareBelowOne
+from ne_dreamer_jax.settings.ranges import LARGEST, Count, NonNegative, Positive, Range, Share, ShareBelowOne
 from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
 
 LOSSES = ("actor", "critic", "replay_critic")
@@ -57,6 +57,11 @@ class BehaviorConfig:
     """lambda of the returns."""
     entropy: NonNegative = 3e-4
     """eta, scale of the policy's entropy."""
+    entropy_final: NonNegative | None = None
+    """What eta falls (or rises) to, linearly over the first `entropy_updates`: a policy that explores at first, and is
+    precise in the end. None: eta stays as it is, as in the paper and DreamerV3."""
+    entropy_updates: Count = 10_000
+    """Updates until `entropy_final`."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
@@ -93,6 +98,15 @@ class Noise(NamedTuple):
 
     action: Array  # [H, M, ...], see `policy_noise`
     latent: Array  # [H, M, S], uniform
+
+
+def entropy_scale(config: BehaviorConfig, update: Array) -> Array:
+    """eta at an update (int32 [], from 0), float32 []."""
+    first = jnp.float32(config.entropy)
+    if config.entropy_final is None:
+        return first
+    share = jnp.minimum(update.astype(jnp.float32) / config.entropy_updates, 1.0)
+    return first + share * (config.entropy_final - first)
 
 
 def imagination_noise(nets: Networks, key: Array, rows: int, horizon: int) -> Noise:
@@ -171,14 +185,16 @@ def actor_critic_losses(
     key: Array,
     rollout: Rollout,
     microbatches: int = 1,
+    entropy_scale: float | Array | None = None,
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
     All of them, the return scale and the metrics are of the rollout's last ``config.imagine_last`` steps, or of all.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
-    their returns are those of all.
+    their returns are those of all. ``entropy_scale`` is eta, by default ``config.entropy``.
     """
+    eta = config.entropy if entropy_scale is None else entropy_scale
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
     bins = symexp_bins(nets.heads.bins)
@@ -225,11 +241,11 @@ def actor_critic_losses(
     distribution = policy(nets.heads, nets.spec.action, outputs)
     entropy = distribution.entropy().T
     if through_model:
-        actor = dynamics_loss(returns / divisor, entropy, weight, config.entropy)
+        actor = dynamics_loss(returns / divisor, entropy, weight, eta)
     else:
         advantage = (returns - value[:, :-1]) / divisor
         log_prob = distribution.log_prob(imagined.action).T
-        actor = reinforce_loss(log_prob, advantage, entropy, weight, config.entropy)
+        actor = reinforce_loss(log_prob, advantage, entropy, weight, eta)
 
     critic = critic_loss(seen.logits, returns.T, seen.slow_value, weight.T, bins, config.slow_scale)  # [H, M]
     replay_critic = _replay_critic_loss(nets, config, params, slow_value, replayed, returns[:, 0])
