@@ -133,6 +133,7 @@ def quickstart(size: str) -> Config:
     It is over before the entropy's weight would have fallen, which stays as it is.
     """
     base = laptop(size)
+    assert isinstance(base.agent, AgentConfig)
     return replace(
         base,
         env=replace(base.env, task="dmc/ball_in_cup_catch"),
