@@ -27,11 +27,11 @@ def main(size: str, method: str, updates: int, assignments: tuple[str, ...]) -> 
     import numpy as np
 
     from benchmarks import common
-    from benchmarks.train_step import configure
+    from experiments.train import configure
     from ne_dreamer_jax.nets.platform import traced_for
 
     with refusing(ValueError):
-        run = configure(size, method, assignments)
+        run = configure("dmc", size, method, {}, assignments)
     accelerator = jax.default_backend()
     try:
         cpu = jax.local_devices(backend="cpu")[0]

@@ -79,10 +79,10 @@ def main(size: str, method: str, target: str, actions: int, task: str | None, as
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_gpu_autotune_level=0"
     from benchmarks import common
-    from benchmarks.train_step import configure
+    from experiments.train import configure
 
     with refusing(ValueError):
-        config = configure(size, method, assignments, task=task)
+        config = configure("dmc", size, method, {"env.task": task}, assignments)
         compiled = compile_step(config, target) if task else compile_update(config, actions, target)
     found = parts(compiled.as_text())
     rows: list[Mapping[str, Any]] = [

@@ -8,6 +8,7 @@ Usage: ``python -m benchmarks.startup --preset quickstart``, or ``python -m benc
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import resource
@@ -76,8 +77,10 @@ def shortest(preset: str, size: str | None) -> Sequence[str]:
 
     config = config_of(preset, size)
     vector_step = config.loop.num_envs * config.env.action_repeat
-    prefill = -(-config.loop.prefill * config.env.action_repeat // vector_step) * vector_step
-    return f"loop.env_steps={prefill + 2 * vector_step}", "loop.eval_every=none"
+    collecting = math.ceil(config.loop.prefill / config.loop.num_envs)
+    replayed = config.agent.batch_size * config.agent.batch_length
+    learning = 1 + math.ceil(replayed / (config.loop.replay_ratio * config.loop.num_envs))
+    return f"loop.env_steps={(collecting + learning) * vector_step}", "loop.eval_every=none"
 
 
 def start(checkout: Path, options: Sequence[str], directory: Path, name: str) -> Start:

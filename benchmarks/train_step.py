@@ -39,6 +39,7 @@ def main(
 ) -> None:
     """Time the update of a preset's agent on what its task shows, in seconds and GEMM units."""
     quiet()
+    from experiments.train import configure
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.agents.dreamer.agent import AgentConfig, parameter_counts
     from ne_dreamer_jax.config import PRESETS
@@ -46,7 +47,7 @@ def main(
     from ne_dreamer_jax.replay import ring as replay
 
     with refusing(ValueError):
-        run = configure(size, method, assignments, preset=preset, task=task)
+        run = configure(preset, size, method, {"env.task": task}, assignments)
         config, spec = run.agent, envs.make(run.env).spec
         agent = make_agent(config, spec)
     state = agent.init(jax.random.key(0))
@@ -82,20 +83,6 @@ def main(
             **{f"parameters_{name}": count for name, count in counts.items()},
         },
     )
-
-
-def configure(
-    size: str | None,
-    method: str,
-    assignments: tuple[str, ...],
-    *,
-    preset: str = "dmc",
-    task: str | None = None,
-) -> Any:
-    """The config of a size and method with settings changed. Raises ValueError as the training command does."""
-    from experiments.train import configure as configure_run
-
-    return configure_run(preset, size, method, {"env.task": task}, assignments)
 
 
 def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable[[], Any]]:

@@ -25,8 +25,8 @@ class OptimizerConfig:
     authors' released code and LaProp's own do."""
     learning_rate: Positive = 4e-5
     actor_rate: Positive = 1.0
-    """The actor's learning rate, relative to that of all else. Below 1, the world model can follow what the actor does:
-    Dreamer (Hafner et al., 2020) has 8e-5 beside the model's 6e-4; DreamerV3 and the paper have one for all."""
+    """The actor's learning rate, relative to that of all else. Dreamer (Hafner et al., 2020) has 8e-5 beside the
+    model's 6e-4; DreamerV3 and the paper have one for all."""
     beta1: ShareBelowOne = 0.9
     beta2: ShareBelowOne = 0.999
     eps: Positive = 1e-20

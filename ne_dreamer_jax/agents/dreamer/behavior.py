@@ -58,8 +58,8 @@ class BehaviorConfig:
     entropy: NonNegative = 3e-4
     """eta, scale of the policy's entropy."""
     entropy_final: NonNegative | None = None
-    """What eta falls (or rises) to, linearly over the first `entropy_updates`: a policy that explores at first, and is
-    precise in the end. None: eta stays as it is, as in the paper and DreamerV3."""
+    """What eta falls (or rises) to, linearly over the first `entropy_updates`. None: eta stays as it is, as in the
+    paper and DreamerV3."""
     entropy_updates: Count = 10_000
     """Updates until `entropy_final`."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
@@ -185,16 +185,17 @@ def actor_critic_losses(
     key: Array,
     rollout: Rollout,
     microbatches: int = 1,
-    entropy_scale: float | Array | None = None,
+    eta: float | Array | None = None,
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
     All of them, the return scale and the metrics are of the rollout's last ``config.imagine_last`` steps, or of all.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
-    their returns are those of all. ``entropy_scale`` is eta, by default ``config.entropy``.
+    their returns are those of all. ``eta`` weighs the entropy, by default
+    as ``config.entropy``.
     """
-    eta = config.entropy if entropy_scale is None else entropy_scale
+    eta = config.entropy if eta is None else eta
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
     bins = symexp_bins(nets.heads.bins)
