@@ -142,6 +142,9 @@ def from_core(core: Core) -> Env:
       ValueError: the core's functions do not fit each other or the specification (the message says which, with what
         was expected and what was got); from ``step``, an action of another shape or dtype than the specification's.
     """
+    for name in ("reset", "step", "observe"):
+        if not callable(function := getattr(core, name)):
+            raise ValueError(f"Core.{name}: expected a function, got {function!r}")
     # Jitted, so that each is traced once, and not anew for the check, for training and for evaluation.
     core = core._replace(reset=jax.jit(core.reset), step=jax.jit(core.step), observe=jax.jit(core.observe))
     _check_core(core)

@@ -189,9 +189,15 @@ def test_what_is_no_environment_is_refused_with_what_to_make_of_it(tmp_path, giv
 
 
 def test_a_step_that_returns_another_state_than_reset_is_named():
-    spec = toy.env().spec
+    reset = lambda key: (jnp.zeros(2),)
     step = lambda state, action: (state[0], base.Progress(*jnp.zeros((4,))))
+    observe = lambda state: {"position": state[0]}
     with pytest.raises(ValueError, match="the state that step returns: expected the structure"):
-        base.from_core(
-            base.Core(spec, lambda key: (jnp.zeros(2),), base.restart_or_step(lambda key: (jnp.zeros(2),), step), None)
-        )
+        base.from_core(base.Core(toy.env().spec, reset, base.restart_or_step(reset, step), observe))
+
+
+@pytest.mark.parametrize("name", ["reset", "step", "observe"])
+def test_what_is_no_function_in_a_core_is_named(name):
+    core = base.Core(toy.env().spec, lambda key: (), lambda *_: (), lambda state: {})._replace(**{name: None})
+    with pytest.raises(ValueError, match=f"Core.{name}: expected a function, got None"):
+        base.from_core(core)
