@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import click
@@ -41,26 +40,22 @@ def main(
 
 
 def _chunk(config: Any, count: int, steps: int, updates: dict[str, int]) -> Callable[[], Any]:
-    """A function that goes on with training, past the steps before the first update; it notes how many there were."""
+    """A function that goes on with training; it notes how many updates that was."""
     import jax
     import jax.numpy as jnp
 
-    import ne_dreamer_jax as nedreamer
+    from benchmarks import training
     from ne_dreamer_jax import loop as loops
     from ne_dreamer_jax.envs import config as env_configs
 
-    env = env_configs.make(config.env)
-    agent = nedreamer.make_agent(config.agent, env.spec)
-    loop = loops.make(replace(config.loop, capacity=20_000), env, agent, config.env.action_repeat)
+    loop = training.make_loop(config, env_configs.make(config.env))
     init, chunk = loops.over_seeds(loop)
-    held: list[Any] = []
+    go_on = training.training(loop, lambda: init(jax.vmap(jax.random.key)(jnp.arange(count))), chunk, steps)
 
     def case() -> Any:
-        if not held:
-            state = init(jax.vmap(jax.random.key)(jnp.arange(count)))
-            held.append(chunk(state, jnp.asarray(loop.budget.prefill, jnp.int32))[0])
-        held[0], report = chunk(held[0], jnp.asarray(steps, jnp.int32))
+        report = go_on()
         updates[f"{count} seeds"] = int(report.updates.sum())
+        return report
 
     return case
 
