@@ -25,7 +25,7 @@ class Stage(NamedTuple):
     """A command, and what takes its arguments' place in the smallest setting."""
 
     name: str
-    module: str
+    module: str  # of this folder, or with its package
     arguments: tuple[str, ...]
     smallest: tuple[str, ...]
     seconds: float  # that it must be given, or it is not begun
@@ -62,6 +62,11 @@ STAGES = (
         "seeds at once", "seeds", ("--seeds", "1", "--seeds", "8"),
         ("--seeds", "2", "--rounds", "1", *_set(*TINY)), 60,
     ),
+    Stage("the same bits again", "repeats", (), ("--updates", "2", *_set(*TINY)), 60),
+    Stage(
+        "learning", "experiments.probes", ("--method", "ne_dreamer", "--probe", "two_steps", "--seeds", "8"),
+        ("--method", "ne_dreamer", "--probe", "bandit", "--seeds", "1"), 60,
+    ),
     _update("50m", "bfloat16", 60),
     _update("200m", "bfloat16", 90),
     Stage(
@@ -71,6 +76,12 @@ STAGES = (
     Stage(
         "methods", "methods", ("--size", "12m"),
         ("--size", "1m", "--method", "dreamer_no_reconstruction", "--rounds", "1"), 120,
+    ),
+    Stage(
+        "a chunk, images kept and drawn again", "methods",
+        ("--method", "ne_dreamer", "--chunk", "--beside", "loop.storage=states"),
+        ("--preset", "laptop", "--method", "ne_dreamer", "--chunk", "--beside", "loop.storage=states", "--rounds", "1",
+         *_set(*TINY)), 90,
     ),
     Stage(
         "an image's place", "storage", (),
@@ -114,10 +125,11 @@ def main(output: Path, minutes: float, smallest: bool) -> None:
 def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float | None) -> str:
     """Runs a stage, stores what it prints, and says how it went."""
     arguments = stage.smallest if smallest else stage.arguments
-    command = [sys.executable, "-m", f"benchmarks.{stage.module}", *arguments]
+    module = stage.module if "." in stage.module else f"benchmarks.{stage.module}"
+    command = [sys.executable, "-m", module, *arguments]
     begin, file = time.monotonic(), output / f"{number}_{stage.module}.txt"
     with file.open("w", encoding="utf-8") as printed:
-        printed.write(f"$ python -m benchmarks.{stage.module} {' '.join(arguments)}\n")
+        printed.write(f"$ python -m {module} {' '.join(arguments)}\n")
         printed.flush()
         try:
             code = subprocess.run(

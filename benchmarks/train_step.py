@@ -6,6 +6,7 @@ in the whole update makes their sum more than the whole.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
+from benchmarks.arithmetic import product_flops
 from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
@@ -54,7 +56,12 @@ def main(
     batch = jax.jit(lambda key: replay.random_batch(spec, config, key))(jax.random.key(1))
     counts = parameter_counts(state.params)
     jitted: Any = agent.train_step
-    temporary = jitted.lower(state, batch).compile().memory_analysis().temp_size_in_bytes
+    begin = time.perf_counter()
+    lowered = jitted.lower(state, batch)
+    traced = time.perf_counter()
+    compiled = lowered.compile()
+    seconds = {"trace_seconds": traced - begin, "compile_seconds": time.perf_counter() - traced}
+    temporary = compiled.memory_analysis().temp_size_in_bytes
     cases: dict[str, Callable[[], Any]] = {}
     if parts and isinstance(config, AgentConfig):
         cases |= _parts(config, spec, state, batch)
@@ -80,6 +87,8 @@ def main(
             "compute_dtype": getattr(config, "compute_dtype", "float32"),
             "parameters": sum(counts.values()),
             "temporary_bytes": temporary,
+            "product_gflop": product_flops(jitted, state, batch) / 1e9,
+            **seconds,
             **{f"parameters_{name}": count for name, count in counts.items()},
         },
     )
