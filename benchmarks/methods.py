@@ -31,7 +31,7 @@ BESIDE = ", beside"
 @click.option("--beside", metavar="PATH=VALUE", multiple=True, help="Settings to time too, and to compare with.")
 @click.option("--chunk", is_flag=True, help="Time 8 vector steps of the whole loop, updates included, not an update.")
 @click.option("--rounds", type=click.IntRange(1), default=3, show_default=True)
-@click.option("--counts", is_flag=True, help="Count parameters only: no compilation, no timing.")
+@click.option("--counts", is_flag=True, help="Count parameters only: no update is compiled.")
 def main(
     preset: str,
     sizes: tuple[str, ...],
@@ -52,6 +52,7 @@ def main(
     """
     quiet()
     from ne_dreamer_jax.agents import make_agent
+    from ne_dreamer_jax.config import PRESETS
 
     for size in sizes or (None,):
         with refusing(ValueError):
@@ -61,7 +62,7 @@ def main(
             configs |= {f"{name}{BESIDE}": config for name, config in others.items()}
             envs = _environments(configs)
         told: dict[str, common.Value] = {
-            "preset": preset, "size": size or "the preset's", "task": next(iter(configs.values())).env.task,
+            "preset": preset, "size": size or PRESETS[preset][1], "task": next(iter(configs.values())).env.task,
             "set": " ".join(assignments) or None, "beside": " ".join(beside) or None,
         }  # fmt: skip
         columns = {name: parameters(make_agent(config.agent, envs[name].spec)) for name, config in configs.items()}
@@ -76,7 +77,7 @@ def main(
         measured = common.measure(cases, rounds=rounds)
         for name in others:
             ratio = measured.cases[f"{name}{BESIDE}"].median / measured.cases[name].median
-            columns[name] = {"times_as_fast": ratio, **columns[name]}
+            columns[name] = {"times_as_fast_as_beside": ratio, **columns[name]}
         common.report("methods", measured, settings={**told, "chunk": str(chunk)}, columns=columns)
 
 
@@ -117,11 +118,10 @@ def _configs(
     from ne_dreamer_jax.config import override
 
     made = {method: configure(preset, size, method, {"env.task": task}) for method in methods}
-    known = {method: settings.paths(config) for method, config in made.items()}
     for assignment in assignments:
         path = assignment.partition("=")[0].strip()
         # Where none has it, the first one says what is wrong.
-        for method in [method for method in methods if path in known[method]] or methods[:1]:
+        for method in [method for method in methods if path in settings.paths(made[method])] or methods[:1]:
             made[method] = override(made[method], assignment)
     return made
 
@@ -156,7 +156,7 @@ def _chunk(config: Any, env: Any) -> tuple[Callable[[], Any], dict[str, common.V
     from benchmarks import training
 
     loop = training.make_loop(config, env)
-    case = training.training(loop, lambda: loop.init(jax.random.key(0)), loop.chunk, VECTOR_STEPS)
+    case = training.chunks(loop, lambda: loop.init(jax.random.key(0)), loop.chunk, VECTOR_STEPS)
     updates = config.loop.replay_ratio * config.loop.num_envs * VECTOR_STEPS
     return case, {"updates": updates / (config.agent.batch_size * config.agent.batch_length)}
 

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import click
@@ -24,12 +25,13 @@ FLAG = "--xla_gpu_deterministic_ops=true"
 @click.option("--method", type=Name("method", names.METHODS), default="ne_dreamer", show_default=True)
 @click.option("--updates", type=click.IntRange(1), default=5, show_default=True)
 @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="Any setting, as experiments.train.")
-@click.option("--worker", is_flag=True, hidden=True)
+@click.option("--worker", is_flag=True, hidden=True, help="Print what one process finds.")
 def main(size: str, method: str, updates: int, assignments: tuple[str, ...], worker: bool) -> None:
     """The same updates twice in one process and again in another, with XLA's deterministic kernels and without.
 
-    A digest is of all parameters after the updates. Processes may differ where a process does not: kernels are chosen
-    by trying them. Beside it stands what a fresh reward head predicts, which is to be exactly 0 on every device.
+    Compared is the whole state after the updates, and what they measured. Processes may differ where a process does
+    not: kernels are chosen by trying them. Beside it stands what a fresh reward head predicts, which is to be exactly 0
+    on every device.
     """
     quiet()
     if worker:
@@ -39,9 +41,12 @@ def main(size: str, method: str, updates: int, assignments: tuple[str, ...], wor
 
     with refusing(ValueError):
         configure("dmc", size, method, {}, assignments)
+    arguments = ["--size", size, "--method", method, "--updates", str(updates)]
+    for assignment in assignments:
+        arguments += ["--set", assignment]
     rows = []
     for name, flags in {"as XLA chooses": "", "deterministic kernels": FLAG}.items():
-        runs = [_in_a_process(flags) for _ in range(2)]
+        runs = [_in_a_process(arguments, flags) for _ in range(2)]
         digests = [digest for run in runs for digest in run["digests"]]
         rows.append(
             {
@@ -59,10 +64,10 @@ def main(size: str, method: str, updates: int, assignments: tuple[str, ...], wor
     print("\n" + json.dumps({"benchmark": "repeats", "machine": common.machine(), "settings": settings, "rows": rows}))
 
 
-def _in_a_process(flags: str) -> dict[str, Any]:
-    """What a worker with this command's own arguments found."""
+def _in_a_process(arguments: Sequence[str], flags: str) -> dict[str, Any]:
+    """What a worker found, with such flags of XLA."""
     environment = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
-    command = [sys.executable, "-m", "benchmarks.repeats", *sys.argv[1:], "--worker"]
+    command = [sys.executable, "-m", "benchmarks.repeats", *arguments, "--worker"]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"a process of its own ended with exit code {done.returncode}, see above")
@@ -70,7 +75,7 @@ def _in_a_process(flags: str) -> dict[str, Any]:
 
 
 def _digests(size: str, method: str, updates: int, assignments: tuple[str, ...]) -> dict[str, Any]:
-    """Digests of the parameters of two trainings from one key, and the largest reward that a fresh head predicts."""
+    """Digests of two trainings from one key, and the largest reward that a fresh head predicts."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -89,10 +94,12 @@ def _digests(size: str, method: str, updates: int, assignments: tuple[str, ...])
     for _ in range(2):
         state = agent.init(jax.random.key(0))
         fresh = _fresh_reward(agent, state.params)
+        measured = []
         for _ in range(updates):
-            state, _, _ = agent.train_step(state, batch)
-        bits = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(state.params))
-        found.append(hashlib.sha256(bits).hexdigest())
+            state, _, metrics = agent.train_step(state, batch)
+            measured.append(metrics)
+        numbers = jax.tree.leaves((state._replace(key=jax.random.key_data(state.key)), measured))
+        found.append(hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in numbers)).hexdigest())
     return {"digests": found, "fresh_reward": fresh}
 
 

@@ -50,7 +50,7 @@ def _chunk(config: Any, count: int, steps: int, updates: dict[str, int]) -> Call
 
     loop = training.make_loop(config, env_configs.make(config.env))
     init, chunk = loops.over_seeds(loop)
-    go_on = training.training(loop, lambda: init(jax.vmap(jax.random.key)(jnp.arange(count))), chunk, steps)
+    go_on = training.chunks(loop, lambda: init(jax.vmap(jax.random.key)(jnp.arange(count))), chunk, steps)
 
     def case() -> Any:
         report = go_on()

@@ -23,9 +23,11 @@ from typing import NamedTuple
 
 import click
 
-from ne_dreamer_jax.commands.options import Name, Task
+from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 
+OTHER_CACHES = {"JAX_COMPILATION_CACHE_DIR", "NE_DREAMER_JAX_CACHE"}
+"""Variables that would keep programs elsewhere, or not at all."""
 TRACED = re.compile(r"Traced in ([\d.]+) s, (.*) in ([\d.]+) s")
 
 
@@ -54,7 +56,9 @@ def main(
 ) -> None:
     """Prints seconds of a cold and of a warm start, medians over the rounds."""
     options = ["--preset", preset, *(["--size", size] if size else []), *(["--task", task] if task else [])]
-    for assignment in (*shortest(preset, size), *assignments):
+    with refusing(ValueError):
+        least = shortest(preset, size, task, assignments)
+    for assignment in (*assignments, *least):
         options += ["--set", assignment]
     places = checkouts or (Path(),)
     starts: dict[tuple[Path, str], list[Start]] = {}
@@ -71,22 +75,23 @@ def main(
         click.echo(f"{place} {how}: {wall:.1f} s, {processor:.1f} of processors")
 
 
-def shortest(preset: str, size: str | None) -> Sequence[str]:
-    """Settings of a run that is over after its first updates."""
-    from ne_dreamer_jax.config import preset as config_of
+def shortest(preset: str, size: str | None, task: str | None, assignments: Sequence[str]) -> Sequence[str]:
+    """Settings of a run that is over after its first updates. Raises ValueError for settings that don't fit."""
+    from ne_dreamer_jax.commands.train import configure
+    from ne_dreamer_jax.loop.budget import Budget
 
-    config = config_of(preset, size)
-    vector_step = config.loop.num_envs * config.env.action_repeat
-    collecting = math.ceil(config.loop.prefill / config.loop.num_envs)
-    replayed = config.agent.batch_size * config.agent.batch_length
-    learning = 1 + math.ceil(replayed / (config.loop.replay_ratio * config.loop.num_envs))
-    return f"loop.env_steps={(collecting + learning) * vector_step}", "loop.eval_every=none"
+    config = configure(preset, size, None, {"env.task": task}, assignments)
+    budget = Budget.of(config.loop, config.agent.batch_size, config.agent.batch_length, config.env.action_repeat)
+    learning = 1 + math.ceil(budget.update_cost / budget.step_credit)
+    steps = (budget.prefill + learning) * budget.num_envs * budget.action_repeat
+    return f"loop.env_steps={steps}", "loop.eval_every=none"
 
 
 def start(checkout: Path, options: Sequence[str], directory: Path, name: str) -> Start:
     """Trains once. Raises RuntimeError where the command fails."""
     command = [sys.executable, "-m", "experiments.train", *options, "--logdir", str(directory / name)]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(directory), "PYTHONPATH": str(checkout)}
+    kept = {name: value for name, value in os.environ.items() if name not in OTHER_CACHES}
+    environment = {**kept, "XDG_CACHE_HOME": str(directory), "PYTHONPATH": str(checkout)}
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -106,6 +106,7 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
     objective = config.objective.build(world_model_of(nets, config.batch_length))
     key = jax.random.key(2)
     params = jax.tree.map(jnp.copy, state.params)  # the update donates the others
+    first = jnp.zeros((), jnp.int32)
     slow, target, scale = jax.tree.map(jnp.copy, (state.slow_critic, state.target, state.return_scale))
     rollout, posterior = jax.jit(lambda p, b: world_model.posterior_rollout(nets, p, key, b))(params, batch)
     optimizer = optim.make(config.optimizer)
@@ -131,7 +132,7 @@ def _parts(config: Any, spec: Any, state: Any, batch: Any) -> dict[str, Callable
         return sum(objective.loss(p, target, key, rollout)[0].values(), jnp.zeros(()))
 
     def actor_critic(p: Any) -> Any:
-        losses, _, _ = behavior.actor_critic_losses(nets, config.behavior, p, slow, scale, key, rollout)
+        losses, _, _ = behavior.actor_critic_losses(nets, config.behavior, p, slow, scale, key, rollout, first)
         return sum(losses.values(), jnp.zeros(()))
 
     def imagined(p: Any, start: Any) -> Any:

@@ -20,7 +20,7 @@ def make_loop(config: Any, env: Any) -> Any:
     return loops.make(options, env, agent, config.env.action_repeat)
 
 
-def training(loop: Any, init: Callable[[], Any], chunk: Callable[..., Any], steps: int) -> Callable[[], Any]:
+def chunks(loop: Any, init: Callable[[], Any], chunk: Callable[..., Any], steps: int) -> Callable[[], Any]:
     """A function that goes on with training by so many vector steps, and returns their `Report`.
 
     Its first call makes the state and takes it past the steps before the first update.

@@ -103,9 +103,9 @@ def test_the_entropys_weight_changes_with_the_updates():
     behavior = REPLACE(tiny.CONFIG.behavior, entropy=0.0, entropy_final=1e4, entropy_updates=10)
     agent, batch = make_agent(REPLACE(tiny.CONFIG, behavior=behavior), tiny.VECTORS), tiny.batch(tiny.VECTORS)
     state = lambda update: tiny.state(agent)._replace(update=jnp.asarray(update, jnp.int32))
-    first, half, full, later = (
-        float(agent.train_step(state(update), batch)[2]["loss/actor"]) for update in (0, 5, 10, 20)
-    )
+    metrics = [agent.train_step(state(update), batch)[2] for update in (0, 5, 10, 20)]
+    np.testing.assert_allclose([x["policy/entropy_scale"] for x in metrics], [0, 5e3, 1e4, 1e4])
+    first, half, full, later = (float(x["loss/actor"]) for x in metrics)
     assert full < first - 1e3
     np.testing.assert_allclose(half - first, (full - first) / 2, rtol=1e-3)
     assert later == full

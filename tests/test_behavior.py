@@ -22,6 +22,8 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 KEY = jax.random.key(3)
 CONFIG = BehaviorConfig(horizon=3, discount=0.9, lam=0.8, entropy=0.1, slow_scale=0.5, return_decay=0.5)
 H, B, T = 3, 2, 5
+NOW = jnp.zeros((), jnp.int32)
+"""The first update."""
 OLD_SCALE = ReturnScale(jnp.asarray(-1.0), jnp.asarray(4.0))
 
 
@@ -32,7 +34,7 @@ def make(spec, config):
 
     def compute(params, slow, batch, key):
         rollout, _ = world_model.posterior_rollout(nets, params, jax.random.key(0), batch)
-        out = behavior.actor_critic_losses(nets, config, params, slow, OLD_SCALE, key, rollout)
+        out = behavior.actor_critic_losses(nets, config, params, slow, OLD_SCALE, key, rollout, NOW)
         return out[0], (out, rollout)
 
     return SimpleNamespace(nets=nets, params=params, slow=slow, batch=batch, compute=compute)
@@ -308,7 +310,9 @@ def test_behaviour_of_the_last_steps_is_that_of_a_rollout_cut_to_them(last):
 
     def losses(config, rollout):
         return jax.jit(
-            lambda params: behavior.actor_critic_losses(model.nets, config, params, model.slow, OLD_SCALE, KEY, rollout)
+            lambda params: behavior.actor_critic_losses(
+                model.nets, config, params, model.slow, OLD_SCALE, KEY, rollout, NOW
+            )
         )(model.params)
 
     got, want = losses(replace(CONFIG, imagine_last=last), rollout), losses(CONFIG, short)

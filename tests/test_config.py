@@ -16,7 +16,7 @@ from ne_dreamer_jax import make_agent, objectives, settings
 from ne_dreamer_jax.agents import drqv2, optim
 from ne_dreamer_jax.agents.dreamer import world_model
 from ne_dreamer_jax.agents.dreamer.agent import BASE_LOSS_SCALES
-from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses, entropy_scale
+from ne_dreamer_jax.agents.dreamer.behavior import actor_critic_losses
 from ne_dreamer_jax.commands import train
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import registry
@@ -316,7 +316,7 @@ CHANGES = {
     "agent.optimizer": {
         "name": "laprop",
         "learning_rate": "1e-4",
-        "actor_rate": "0.5",
+        "actor_rate_factor": "0.5",
         "beta1": "0.8",
         "beta2": "0.99",
         "eps": "1e-8",
@@ -421,9 +421,10 @@ def behavior(config):
     nets = tiny.networks(tiny.VECTORS)
     params = jax.eval_shape(nets.init, KEY)
     rollout, scale = rollout_of(nets), ReturnScale(jnp.zeros(()), jnp.zeros(()))
-    yield program(lambda update: entropy_scale(config.agent.behavior, update), jnp.ones((), jnp.int32))
     yield program(
-        lambda p: actor_critic_losses(nets, config.agent.behavior, p, p["critic"], scale, KEY, rollout), params
+        lambda p, update: actor_critic_losses(nets, config.agent.behavior, p, p["critic"], scale, KEY, rollout, update),
+        params,
+        jnp.ones((), jnp.int32),
     )
 
 

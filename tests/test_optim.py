@@ -37,7 +37,7 @@ def test_the_actor_has_a_rate_of_its_own(name):
     rng = np.random.default_rng(0)
     params = {part: jnp.asarray(rng.normal(size=3), jnp.float32) for part in ("actor", "critic")}
     gradients = [jax.tree.map(lambda x: jnp.asarray(rng.normal(size=3), jnp.float32), params) for _ in range(3)]
-    alike, slower = (run(OptimizerConfig(name, actor_rate=r, **PLAIN), params, gradients) for r in (1.0, 0.25))
+    alike, slower = (run(OptimizerConfig(name, actor_rate_factor=r, **PLAIN), params, gradients) for r in (1.0, 0.25))
     for one, other in zip(alike, slower, strict=True):
         np.testing.assert_array_equal(other["critic"], one["critic"])
         np.testing.assert_allclose(other["actor"] - params["actor"], (one["actor"] - params["actor"]) / 4, rtol=1e-3)

@@ -24,9 +24,9 @@ class OptimizerConfig:
     """laprop is what DreamerV3 uses; laprop_weighted, whose momentum weighs each step by its learning rate, what the
     authors' released code and LaProp's own do."""
     learning_rate: Positive = 4e-5
-    actor_rate: Positive = 1.0
-    """The actor's learning rate, relative to that of all else. Dreamer (Hafner et al., 2020) has 8e-5 beside the
-    model's 6e-4; DreamerV3 and the paper have one for all."""
+    actor_rate_factor: Positive = 1.0
+    """The actor's learning rate is so many times `learning_rate`. DreamerV3 and the paper have one rate for all;
+    Dreamer (Hafner et al., 2020) trains actor and value model at 8e-5, beside the world model's 6e-4."""
     beta1: ShareBelowOne = 0.9
     beta2: ShareBelowOne = 0.999
     eps: Positive = 1e-20
@@ -133,7 +133,7 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
     :math:`m(g / (\sqrt{v(g^2)} + \epsilon))`. Update number u (from 0) is taken with the learning rate times
     min(1, (u + 1) / warmup); in LaProp's own code a normalised gradient counts in m by the learning rate of its update,
     which is another average while that rises (``laprop_weighted``). The learning rate of parameters under the name
-    ``actor`` is ``actor_rate`` times that.
+    ``actor`` is ``actor_rate_factor`` times that.
 
     With the default epsilon only gradients that are exactly zero, or whose squares' average underflows in float32
     (below 3e-18), feel it; zero gradients give zero updates.
@@ -163,8 +163,8 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
     def update(updates, state, params=None):
         with jax.numpy_dtype_promotion("standard"):  # optax raises floats to int32 powers
             updates, state = chain.update(updates, state, params)
-        if config.actor_rate != 1.0:
-            updates = {**updates, "actor": optax.tree.scale(config.actor_rate, updates["actor"])}
+        if config.actor_rate_factor != 1.0:
+            updates = {**updates, "actor": optax.tree.scale(config.actor_rate_factor, updates["actor"])}
         return updates, state
 
     return optax.GradientTransformation(chain.init, update)

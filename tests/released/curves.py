@@ -3,13 +3,14 @@
 A RUN is a directory of `learn`, or of ``experiments.train`` with the command that `learn` prints. For each task
 OUT/TASK.png shows the returns of the evaluations, each seed's and their means; what is printed beside it are the
 differences from the authors' code, with 95 % intervals and p-values (Welch), of the last evaluation and of the mean
-over evaluations. Needs scipy, and no PyTorch.
+over evaluations. Our runs in ``dm_control:TASK`` are laid beside those in ``dmc/TASK``. Needs scipy, and no PyTorch.
 """
 
 from __future__ import annotations
 
 import functools
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from ne_dreamer_jax.runs import metrics, plots, run_directory
 MARKER = "released.json"
 """What marks a run of the authors' code: its setting, as ours."""
 THEIRS, AS_PUBLISHED, OURS = "released code", "released code as published", "this package"
-CHOSEN = {"seed", "env.task", "loop.eval_every", "loop.chunk_steps"}
+CHOSEN = {"seed", "env", "env.task", "loop.eval_every", "loop.chunk_steps"}
 """Settings in which runs that are compared may differ; tasks are compared one by one."""
 
 
@@ -42,17 +43,23 @@ class Run(NamedTuple):
 
 def read(path: Path) -> Run:
     """A run of either. Raises ValueError or RefusedError where there is none, or none that was evaluated."""
-    label = OURS
     if (path / MARKER).exists():
         said: dict[str, Any] = json.loads((path / MARKER).read_text(encoding="utf-8"))
         label = AS_PUBLISHED if said["as_published"] else THEIRS
         config = settings.from_dict(Config, said["config"])
     else:
         config = run_directory.read_config(path, Config)
+        family, separator, _ = config.env.task.partition(":")
+        label = f"{OURS}, in {family}" if separator else OURS
     steps, returns = metrics.series(metrics.read(path / "metrics.jsonl"), "eval/return")
     if not len(steps):
         raise ValueError(f"expected a run that was evaluated, got none in {path}")
     return Run(path, label, config, steps, returns)
+
+
+def task_of(run: Run) -> str:
+    """The task's name, whichever simulator it runs in."""
+    return re.split("[/:]", run.config.env.task)[-1]
 
 
 def check_same(runs: Sequence[Run]) -> None:
@@ -61,7 +68,9 @@ def check_same(runs: Sequence[Run]) -> None:
     before = settings.paths(first.config)
     for run in runs:
         after = settings.paths(run.config)
-        if different := {name for name in before | after if before.get(name) != after.get(name)} - CHOSEN:
+        alone = {name for name in before.keys() ^ after.keys() if name.startswith("env.")}  # another simulator's
+        changed = {name for name in before | after if before.get(name) != after.get(name)}
+        if different := changed - alone - CHOSEN:
             raise ValueError(f"expected runs of one setting, got others in {first.path} and {run.path}: {different}")
         if (run.label, run.config.seed) in seen:
             raise ValueError(f"expected each seed once, got seed {run.config.seed} again in {run.path}")
@@ -112,12 +121,12 @@ def main(out: Path, paths: tuple[Path, ...]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with refusing(ValueError, run_directory.RefusedError):
         found = [read(path) for path in paths]
-        for task in dict.fromkeys(run.config.env.task for run in found):
-            runs = [run for run in found if run.config.env.task == task]
+        for task in dict.fromkeys(task_of(run) for run in found):
+            runs = [run for run in found if task_of(run) == task]
             check_same(runs)
-            labels = [label for label in (THEIRS, AS_PUBLISHED, OURS) if any(run.label == label for run in runs)]
+            labels = sorted({run.label for run in runs}, key=lambda label: (label.startswith(OURS), label))
             by_label = {label: [run for run in runs if run.label == label] for label in labels}
-            picture = out / f"{task.replace('/', '-').replace(':', '-')}.png"
+            picture = out / f"{task}.png"
             curves = {label: [(run.steps, run.returns) for run in each] for label, each in by_label.items()}
             budget = runs[0].config.loop.env_steps
             plots.comparison(curves, picture, title=f"{task}, from vectors", env_steps=budget, published={})

@@ -74,6 +74,8 @@ TAKEN = re.compile(
 """Settings that their code takes, or that change nothing of what is learned."""
 EVALUATED = 1_000
 """Environments of evaluations are seeded from here on, after those of training."""
+APART = 10_000
+"""Between the environments' seeds of one run and those of the next: theirs lie side by side, and would be shared."""
 LOG_EVERY = 1_000
 """Environment steps between lines about training."""
 NAMES = {
@@ -136,8 +138,8 @@ def trainer_length(config: Config) -> int:
     steps, extra = config.agent.batch_size * config.agent.batch_length, 3
     length, rest = divmod(config.loop.prefill, config.loop.num_envs)
     length -= extra
-    if rest or length < config.agent.batch_length or steps % length:
-        fitting = [config.loop.num_envs * (n + extra) for n in range(1, steps + 1) if steps % n == 0]
+    if rest or length < (least := config.agent.batch_length) or steps % length:
+        fitting = [config.loop.num_envs * (n + extra) for n in range(least, steps + 1) if steps % n == 0]
         raise ValueError(f"loop.prefill: expected one of {fitting}, got {config.loop.prefill}")
     return length
 
@@ -250,14 +252,14 @@ def put_aside() -> None:
 
 
 def environments(config: Config, count: int, first: int = 0) -> Any:
-    """So many of their environments, with the seeds from ``seed + first`` on."""
+    """So many of their environments, with the seeds from ``APART * seed + first`` on."""
     theirs = importlib.import_module("envs")
     asked = compare.Settings(
         task=config.env.task.replace("/", "_", 1),
         action_repeat=config.env.action_repeat,
         time_limit=1_000,
         size=(1, 1),
-        seed=config.seed,
+        seed=APART * config.seed,
     )
 
     def constructor(place: int) -> Callable[[], Any]:
@@ -304,11 +306,9 @@ def agent_of(dreamer: Any, config: Config, environments: Any) -> Any:
 
 def learn(dreamer: Any, config: Config, log: Log, out: Path, as_published: bool) -> None:
     """Trains their agent with their trainer."""
-    put_aside()
     importlib.import_module("tools").set_seed_everywhere(config.seed)
     training = environments(config, config.loop.num_envs)
     evaluation = environments(config, config.loop.eval_episodes, EVALUATED)
-    check_observed(config, training)
     agent = agent_of(dreamer, config, training)
     agent.update = log.counted(agent.update)
     batch = {"batch_size": config.agent.batch_size, "batch_length": config.agent.batch_length}
@@ -369,10 +369,13 @@ def main(
     click.echo(f"{config.loop.env_steps:,} environment steps, {budget.updates:,} updates of ours")
     torch.set_num_threads(1)
     dreamer = compare.load(checkout)
+    put_aside()
+    with refusing(ValueError):
+        check_observed(config, environments(config, 1))
     out.mkdir(parents=True, exist_ok=True)
     said = {"as_published": as_published, "config": settings.to_dict(config)}
     (out / curves.MARKER).write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
-    with metrics.Writer(out / "metrics.jsonl") as writer, refusing(ValueError):
+    with metrics.Writer(out / "metrics.jsonl") as writer:
         learn(dreamer, config, Log(writer, repeat), out, as_published)
 
 

@@ -167,8 +167,8 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
             state.return_scale,
             imagine_key,
             rollout,
+            state.update,
             config.microbatches,
-            behavior.entropy_scale(config.behavior, state.update),
         )
         named = {**model, **representation, **actor_critic}
         total = sum((config.loss_scales[name] * value for name, value in named.items()), jnp.zeros(()))

@@ -61,7 +61,7 @@ class BehaviorConfig:
     """What eta falls (or rises) to, linearly over the first `entropy_updates`. None: eta stays as it is, as in the
     paper and DreamerV3."""
     entropy_updates: Count = 10_000
-    """Updates until `entropy_final`."""
+    """Updates until `entropy_final`, where there is one. A forked run counts its parent's updates too."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
@@ -184,18 +184,18 @@ def actor_critic_losses(
     scale: ReturnScale,
     key: Array,
     rollout: Rollout,
+    update: Array,
     microbatches: int = 1,
-    eta: float | Array | None = None,
 ) -> tuple[dict[str, Array], ReturnScale, Metrics]:
     """Actor and critic losses in imagination and the critic's on replay, each averaged; and the new return scale.
 
     All of them, the return scale and the metrics are of the rollout's last ``config.imagine_last`` steps, or of all.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
-    their returns are those of all. ``eta`` weighs the entropy, by default
-    as ``config.entropy``.
+    their returns are those of all. The entropy's weight is that
+    of the ``update``, int32 [].
     """
-    eta = config.entropy if eta is None else eta
+    eta = entropy_scale(config, update)
     frozen = jax.lax.stop_gradient(params)
     through_model = config.gradient == "dynamics"
     bins = symexp_bins(nets.heads.bins)
@@ -258,6 +258,8 @@ def actor_critic_losses(
         "imagined/return_scale": divisor,
         "policy/entropy": jnp.mean(entropy),
     }
+    if config.entropy_final is not None:
+        metrics["policy/entropy_scale"] = eta
     return losses, scale, jax.lax.stop_gradient(metrics)
 
 
