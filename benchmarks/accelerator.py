@@ -67,7 +67,7 @@ STAGES = (
     Stage("the same bits again", "repeats", (), ("--updates", "2", *_set(*TINY)), 120),
     Stage(
         "learning", "experiments.probes", ("--method", "ne_dreamer", "--probe", "two_steps", "--seeds", "8"),
-        ("--method", "ne_dreamer", "--probe", "bandit", "--seeds", "1"), 60,
+        ("--method", "ne_dreamer", "--probe", "bandit", "--seeds", "1"), 90,
     ),
     _update("50m", "bfloat16", 60),
     _update("200m", "bfloat16", 90),
