@@ -32,6 +32,11 @@ class Stage(NamedTuple):
     smallest: tuple[str, ...]
     seconds: float  # it is not begun with less time left
 
+    @property
+    def path(self) -> str:
+        """What ``python -m`` runs."""
+        return self.module if "." in self.module else f"benchmarks.{self.module}"
+
 
 def _set(*assignments: str) -> tuple[str, ...]:
     return tuple(word for assignment in assignments for word in ("--set", f"agent.{assignment}"))
@@ -127,11 +132,10 @@ def main(output: Path, minutes: float, smallest: bool) -> None:
 def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float | None) -> str:
     """Runs a stage, stores what it prints, and says how it went."""
     arguments = stage.smallest if smallest else stage.arguments
-    module = stage.module if "." in stage.module else f"benchmarks.{stage.module}"
-    command = [sys.executable, "-m", module, *arguments]
+    command = [sys.executable, "-m", stage.path, *arguments]
     begin, file = time.monotonic(), output / f"{number}_{stage.module}.txt"
     with file.open("w", encoding="utf-8") as printed:
-        printed.write(f"$ python -m {module} {' '.join(arguments)}\n")
+        printed.write(f"$ python -m {stage.path} {' '.join(arguments)}\n")
         printed.flush()
         process = subprocess.Popen(command, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True)
         try:

@@ -60,14 +60,12 @@ def main(size: str, method: str, updates: int, assignments: tuple[str, ...]) -> 
 def _losses(run: Any, updates: int, device: Any) -> list[dict[str, float]]:
     """The losses of so many updates from the first state, on one batch."""
     import jax
-    import jax.numpy as jnp
 
+    from benchmarks import training
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.replay import ring
-    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
-    side = run.env.image_size
-    spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(6))
+    spec = training.pixels(run)
     with jax.default_device(device):
         agent = make_agent(run.agent, spec)
         state = agent.init(jax.random.key(0))

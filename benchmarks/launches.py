@@ -109,15 +109,13 @@ def main(size: str, method: str, target: str, actions: int, task: str | None, as
 def compile_update(config: Any, actions: int, target: str) -> Any:
     """An update of the agent, compiled. Raises ValueError where the target's compiler is not installed."""
     import jax
-    import jax.numpy as jnp
 
+    from benchmarks import training
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.nets.platform import traced_for
     from ne_dreamer_jax.replay import ring as replay
-    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
-    side = config.env.image_size
-    spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
+    spec = training.pixels(config, actions)
     with traced_for(target):
         agent = make_agent(config.agent, spec)
         state = jax.eval_shape(agent.init, jax.random.key(0))

@@ -77,17 +77,15 @@ def _in_a_process(arguments: Sequence[str], flags: str) -> dict[str, Any]:
 def _digests(size: str, method: str, updates: int, assignments: tuple[str, ...]) -> dict[str, Any]:
     """Digests of two trainings from one key, and the largest reward that a fresh head predicts."""
     import jax
-    import jax.numpy as jnp
     import numpy as np
 
+    from benchmarks import training
     from experiments.train import configure
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.replay import ring
-    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
 
-    run: Any = configure("dmc", size, method, {}, assignments)
-    side = run.env.image_size
-    spec = EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(6))
+    run = configure("dmc", size, method, {}, assignments)
+    spec = training.pixels(run)
     agent = make_agent(run.agent, spec)
     batch = jax.jit(lambda key: ring.random_batch(spec, run.agent, key))(jax.random.key(1))
     found, fresh = [], None

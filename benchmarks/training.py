@@ -1,4 +1,4 @@
-"""The whole training loop as something to time."""
+"""What several benchmarks train: an agent on pixels alone, and the whole loop."""
 
 from __future__ import annotations
 
@@ -8,6 +8,16 @@ from typing import Any
 
 CAPACITY = 20_000
 """Transitions in replay: enough to begin with, and little to hold."""
+
+
+def pixels(config: Any, actions: int = 6) -> Any:
+    """The specification of an environment with images of the configuration's size and so many continuous actions."""
+    import jax.numpy as jnp
+
+    from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec
+
+    side = config.env.image_size
+    return EnvSpec({"image": ArraySpec((side, side, 3), jnp.uint8)}, ContinuousAction(actions))
 
 
 def make_loop(config: Any, env: Any) -> Any:

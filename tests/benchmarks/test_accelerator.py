@@ -10,10 +10,9 @@ from benchmarks import accelerator
 
 @pytest.mark.parametrize("stage", accelerator.STAGES, ids=lambda stage: stage.name)
 def test_the_stages_are_commands_that_exist_with_options_that_they_have(stage):
-    module = stage.module if "." in stage.module else f"benchmarks.{stage.module}"
-    command = importlib.import_module(module).main
+    command = importlib.import_module(stage.path).main
     for arguments in (stage.arguments, stage.smallest):
-        command.make_context(module, list(arguments))
+        command.make_context(stage.path, list(arguments))
 
 
 @pytest.mark.parametrize(

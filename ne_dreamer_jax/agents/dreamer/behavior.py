@@ -192,8 +192,7 @@ def actor_critic_losses(
     All of them, the return scale and the metrics are of the rollout's last ``config.imagine_last`` steps, or of all.
     The imagined losses train the actor and the critic alone. The replayed one also trains the world model, through
     ``rollout.feature`` (DreamerV3). The trajectories may be imagined in several ``microbatches``; the percentiles of
-    their returns are those of all. The entropy's weight is that
-    of the ``update``, int32 [].
+    their returns are those of all. The entropy's weight is that of the ``update``, int32 [].
     """
     eta = entropy_scale(config, update)
     frozen = jax.lax.stop_gradient(params)
