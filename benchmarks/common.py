@@ -125,8 +125,11 @@ def report(
     print(f"on {machine()}; medians of {rounds} interleaved rounds")
     print(
         f"one GEMM unit (a {GEMM_SIZE}^3 float32 matrix product): {gemm.median:.4g} s, "
-        f"{gemm.low:.4g} to {gemm.high:.4g}, {gflops:.0f} GFLOP/s\n"
+        f"{gemm.low:.4g} to {gemm.high:.4g}, {gflops:.0f} GFLOP/s"
     )
+    if (peak := peak_bytes()) is not None:
+        print(f"at most {peak / 1e9:.3g} GB of the device's memory were in use at once, in the whole process")
+    print()
     print(table(rows))
     line = {
         "benchmark": name,
@@ -134,10 +137,16 @@ def report(
         "settings": dict(settings),
         "rounds": rounds,
         "gemm_seconds": gemm.median,
+        "peak_bytes": peak_bytes(),
         "rows": rows,
     }
     print("\n" + json.dumps(line))
     return line
+
+
+def peak_bytes() -> int | None:
+    """The most of the first device's memory that this process has held at once; None where the device can't tell."""
+    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
 
 
 def table(rows: Sequence[Mapping[str, Value]]) -> str:

@@ -34,9 +34,10 @@ def main(sizes: tuple[str, ...], task: str, compiles: bool, assignments: tuple[s
     for size in dict.fromkeys(sizes):
         with refusing(ValueError):
             rows.append(_row(configure("dmc", size, None, {"env.task": task}, assignments), size, compiles))
-            click.echo(json.dumps(rows[-1]), err=True)
+            click.echo(f"{size}: done", err=True)
     print(f"memory: {task}, batches of the dmc preset; bytes in GB\n")
-    print(common.table([{name: x / 1e9 if name.endswith("_gb") else x for name, x in row.items()} for row in rows]))
+    rows = [{name: x / 1e9 if name.endswith("_gb") else x for name, x in row.items()} for row in rows]
+    print(common.table(rows))
     print("\n" + json.dumps({"benchmark": "memory", "machine": common.machine(), "task": task, "rows": rows}))
 
 

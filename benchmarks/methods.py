@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from benchmarks import common
 from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
+
+if TYPE_CHECKING:
+    from benchmarks import common
 
 METHODS = tuple(name for name in names.METHODS if "/" not in name)
 VECTOR_STEPS = 8
@@ -51,6 +53,7 @@ def main(
     arithmetic its matrix products are. Of --set and --beside a method gets those that it has.
     """
     quiet()
+    from benchmarks import common
     from ne_dreamer_jax.agents import make_agent
     from ne_dreamer_jax.config import PRESETS
 

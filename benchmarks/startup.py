@@ -3,7 +3,7 @@
 Each checkout trains in a directory of its own until it has learned a little, twice; checkouts take turns. Processor
 seconds count what all threads did, and say more than seconds on a machine that others use.
 
-Usage: ``python -m benchmarks.startup --preset quickstart``, or ``python -m benchmarks.startup ../before .``
+Usage: python -m benchmarks.startup --preset quickstart, or python -m benchmarks.startup ../before .
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import click
 
+from benchmarks.checkout import Checkout
 from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 
@@ -40,7 +41,7 @@ class Start(NamedTuple):
 
 
 @click.command(help=__doc__, context_settings={"show_default": True, "max_content_width": 110})
-@click.argument("checkouts", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("checkouts", nargs=-1, type=Checkout("experiments/__init__.py", "experiments/train.py"))
 @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart")
 @click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--task", type=Task(), help="Default: the preset's.")
@@ -88,7 +89,7 @@ def shortest(preset: str, size: str | None, task: str | None, assignments: Seque
 
 
 def start(checkout: Path, options: Sequence[str], directory: Path, name: str) -> Start:
-    """Trains once. Raises RuntimeError where the command fails."""
+    """Trains once. Raises ClickException, with the end of what was printed, where the command fails."""
     command = [sys.executable, "-m", "experiments.train", *options, "--logdir", str(directory / name)]
     kept = {name: value for name, value in os.environ.items() if name not in OTHER_CACHES}
     environment = {**kept, "XDG_CACHE_HOME": str(directory), "PYTHONPATH": str(checkout)}
@@ -96,7 +97,9 @@ def start(checkout: Path, options: Sequence[str], directory: Path, name: str) ->
     done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
-        raise RuntimeError(f"expected training to end well, got exit code {done.returncode}: {done.stderr[-2000:]}")
+        raise click.ClickException(
+            f"{checkout}: expected training to end well, got exit code {done.returncode}: {done.stderr[-2000:]}"
+        )
     traced = TRACED.search(done.stdout)
     chunk = "" if traced is None else f"the chunk traced in {traced[1]} s, {traced[2]} in {traced[3]} s"
     return Start(wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, chunk)

@@ -22,6 +22,8 @@ from ne_dreamer_jax.system.quiet import quiet
 @click.option("--rounds", type=click.IntRange(1), default=9, show_default=True)
 def main(envs: int, rows: int, side: int, batch_size: int, batch_length: int, rounds: int) -> None:
     """Time storing one image of every environment, and fetching a batch, in the device's memory and in the host's."""
+    if rows <= batch_length:
+        raise click.UsageError(f"--rows: expected more than --batch-length, {batch_length}, got {rows}")
     quiet()
     import jax
     import jax.numpy as jnp

@@ -3,7 +3,7 @@
 Each checkout trains by its own quickstart, so that the programs differ where presets do. It has a process of its own,
 which compiles the chunk and then waits; they take turns, so that what else the machine does falls on all of them alike.
 
-Usage: ``git worktree add ../before HEAD~10; python -m benchmarks.versions ../before .``
+Usage: git worktree add ../before HEAD~10; python -m benchmarks.versions ../before .
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 
 import click
+
+from benchmarks.checkout import Checkout
 
 WORKER = """
 import sys, time
@@ -38,7 +40,9 @@ for _ in sys.stdin:
 
 
 @click.command(help=__doc__, context_settings={"show_default": True})
-@click.argument("checkouts", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument(
+    "checkouts", nargs=-1, required=True, type=Checkout("ne_dreamer_jax/__init__.py", "ne_dreamer_jax/config.py")
+)
 @click.option("--rounds", type=click.IntRange(1), default=20, help="Chunks timed of each.")
 def main(checkouts: tuple[Path, ...], rounds: int) -> None:
     """Prints milliseconds of a chunk of 8 vector steps, updates included, and its ratio to the first checkout's."""

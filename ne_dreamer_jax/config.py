@@ -130,7 +130,7 @@ def quickstart(size: str) -> Config:
 
 
 def rooms_small(size: str) -> Config:
-    """Learns to remember in half an hour of a CPU core: a small agent with half the state, on a small task.
+    """Learns to remember in some twenty minutes of a CPU core: a small agent with half the state, on a small task.
 
     Frames of 24 x 24 are halved three times. A trial of the task takes some nine steps, so that most of the sequences
     of 16 hold what is to be remembered and what comes of it; returns are in tens, and need no smaller floor than 1.
