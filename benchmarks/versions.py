@@ -17,6 +17,7 @@ import click
 
 from benchmarks.checkout import Checkout
 
+CHECKOUT = Checkout("ne_dreamer_jax/__init__.py", "ne_dreamer_jax/config.py")
 WORKER = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
