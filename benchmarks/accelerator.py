@@ -23,6 +23,7 @@ import click
 
 from ne_dreamer_jax.commands.options import UserPath, say
 
+RESULTS = "results.jsonl"
 TINY = ("batch_size=2", "batch_length=8", "behavior.horizon=2")
 
 
@@ -138,9 +139,12 @@ def main(output: Path, minutes: float, smallest: bool) -> None:
     It needs JAX for the accelerator, for NVIDIA GPUs by `pip install -e '.[cuda]'`. The same command on the same folder
     runs what was left out or failed. Exit code 1: a stage failed.
     """
-    done = _begin(output, smallest)
+    done = _done(output, smallest)
     if not smallest:
         _expect_accelerator()
+    with _refusing(output):
+        output.mkdir(parents=True, exist_ok=True)
+        (output / RESULTS).touch()
     with _unwinding_on_sigterm():
         count = _run_all(output, done, smallest, time.monotonic() + 60 * minutes)
     say(f"{', '.join(f'{number} {how}' for how, number in count.items())}; figures are in {output}")
@@ -166,22 +170,23 @@ def _run_all(output: Path, done: set[str], smallest: bool, deadline: float) -> d
     return count
 
 
-def _begin(output: Path, smallest: bool) -> set[str]:
-    """Makes the folder, or goes on with it; the names of stages that are done.
+def _done(output: Path, smallest: bool) -> set[str]:
+    """The names of stages that are done in the folder, if there is one.
 
     Raises:
-      UsageError: it can't be made, holds something else, or was begun in the other setting.
+      UsageError: it holds something else, or was begun in the other setting.
     """
-    results = output / "results.jsonl"
+    if not output.exists():
+        return set()
+    results = output / RESULTS
     with _refusing(output):
-        if output.is_dir() and any(output.iterdir()) and not results.exists():
+        if any(output.iterdir()) and not results.exists():
             raise click.UsageError(
-                f"--output: expected a new folder or one with results.jsonl, got {output}, which holds something else; "
+                f"--output: expected a new folder or one with {RESULTS}, got {output}, which holds something else; "
                 "choose another name"
             )
-        output.mkdir(parents=True, exist_ok=True)
-        results.touch()
-        lines = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
+        text = results.read_text(encoding="utf-8") if results.exists() else ""
+        lines = [json.loads(line) for line in text.splitlines()]
     if any(line["smallest"] != smallest for line in lines):
         raise click.UsageError(
             f"--output: {output} was begun {'without' if smallest else 'with'} --smallest; choose another name"
@@ -249,7 +254,7 @@ def _run(stage: Stage, output: Path, number: str, smallest: bool, seconds: float
     say("\n".join(line for line in lines if not _is_result(line)))
     if code:
         return "failed", f"failed with exit code {code} after {taken:.0f} s"
-    with (output / "results.jsonl").open("a", encoding="utf-8") as results:
+    with (output / RESULTS).open("a", encoding="utf-8") as results:
         for line in _results(lines):
             told = {"stage": stage.name, "smallest": smallest, "seconds_in_all": taken, **line}
             results.write(json.dumps(told) + "\n")

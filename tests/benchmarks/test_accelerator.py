@@ -81,6 +81,7 @@ def test_what_can_not_be_measured_is_refused(tmp_path):
     ]:
         found = CliRunner().invoke(accelerator.main, options)
         assert (found.exit_code, words in found.output) == (2, True), found.output
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_stage_ends_with_the_benchmark(tmp_path, make_stage):
