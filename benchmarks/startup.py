@@ -27,6 +27,7 @@ from benchmarks.checkout import Checkout
 from ne_dreamer_jax.commands.options import Name, Task, refusing
 from ne_dreamer_jax.settings import names
 
+CHECKOUT = Checkout("experiments/__init__.py", "experiments/train.py", "ne_dreamer_jax/__init__.py")
 OTHER_CACHES = {"JAX_COMPILATION_CACHE_DIR", "NE_DREAMER_JAX_CACHE"}
 """Variables that would keep programs elsewhere, or not at all."""
 TRACED = re.compile(r"Traced in ([\d.]+) s, (.*) in ([\d.]+) s")
@@ -41,7 +42,7 @@ class Start(NamedTuple):
 
 
 @click.command(help=__doc__, context_settings={"show_default": True, "max_content_width": 110})
-@click.argument("checkouts", nargs=-1, type=Checkout("experiments/__init__.py", "experiments/train.py"))
+@click.argument("checkouts", nargs=-1, type=CHECKOUT)
 @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart")
 @click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
 @click.option("--task", type=Task(), help="Default: the preset's.")

@@ -41,9 +41,7 @@ for _ in sys.stdin:
 
 
 @click.command(help=__doc__, context_settings={"show_default": True})
-@click.argument(
-    "checkouts", nargs=-1, required=True, type=Checkout("ne_dreamer_jax/__init__.py", "ne_dreamer_jax/config.py")
-)
+@click.argument("checkouts", nargs=-1, required=True, type=CHECKOUT)
 @click.option("--rounds", type=click.IntRange(1), default=20, help="Chunks timed of each.")
 def main(checkouts: tuple[Path, ...], rounds: int) -> None:
     """Prints milliseconds of a chunk of 8 vector steps, updates included, and its ratio to the first checkout's."""

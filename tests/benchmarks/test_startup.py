@@ -25,8 +25,9 @@ def test_a_folder_that_is_no_checkout_is_refused(tmp_path, command):
 
 
 def test_a_failing_start_is_told_in_a_sentence(tmp_path):
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments" / "__init__.py").touch()
+    for package in ("experiments", "ne_dreamer_jax"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
     (tmp_path / "experiments" / "train.py").write_text("raise SystemExit('broken')")
     found = CliRunner().invoke(startup.main, [str(tmp_path), "--rounds", "1"])
     assert found.exit_code == 1
