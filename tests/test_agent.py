@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from types import SimpleNamespace
 
 import jax
@@ -109,6 +110,13 @@ def test_the_entropys_weight_changes_with_the_updates():
     assert full < first - 1e3
     np.testing.assert_allclose(half - first, (full - first) / 2, rtol=1e-3)
     assert later == full
+
+
+def test_profilers_see_an_updates_parts_by_name():
+    agent, batch = make_agent(tiny.CONFIG, tiny.VECTORS), tiny.batch(tiny.VECTORS)
+    text = agent.train_step.lower(tiny.state(agent), batch).as_text(debug_info=True)
+    for part in ("posterior", "predictions", "objective", "behavior", "imagination", "optimizer"):
+        assert re.search(rf'"[^"]*\b{part}\b[^"]*/dot_general"', text) or (part == "optimizer" and part in text), part
 
 
 def test_losses_are_reported_by_name_and_weighed(update):

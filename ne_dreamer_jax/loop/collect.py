@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 
 from ne_dreamer_jax.agents.base import Agent
@@ -36,13 +37,16 @@ def collect(
       The state with one more row in replay, and the sums.
     """
     step_share = parallel.per_shard(env.step, (parallel.SPLIT, parallel.SPLIT), parallel.SPLIT)
-    env_state, timestep = step_share(state.env, state.policy.prev_action)
-    policy, action = agent.act(state.train.params, state.policy, timestep, key)
+    with jax.named_scope("environments"):
+        env_state, timestep = step_share(state.env, state.policy.prev_action)
+    with jax.named_scope("acting"):
+        policy, action = agent.act(state.train.params, state.policy, timestep, key)
     if env.start is not None:  # the environments take their step while the agent learns
         env_state = env.start(env_state, action)
-    obs = storage.encode_obs(env_state, timestep.obs, ring.next_row(state.replay))
-    step = transition(time_limits, timestep._replace(obs=obs), policy, action)
-    replay = ring.add(state.replay, step)
+    with jax.named_scope("replay"):
+        obs = storage.encode_obs(env_state, timestep.obs, ring.next_row(state.replay))
+        step = transition(time_limits, timestep._replace(obs=obs), policy, action)
+        replay = ring.add(state.replay, step)
 
     ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
     length = jnp.where(timestep.is_first, 0, state.episodes.length + 1)

@@ -13,6 +13,7 @@ from ne_dreamer_jax.replay.storage import Storage
 from ne_dreamer_jax.types import Array, Batch, Metrics
 
 
+@jax.named_scope("replay")
 def draw_batch(agent: Agent, storage: Storage, replay: Any, key: Array) -> Batch:
     """B sequences of T steps out of replay, with observations as the agent takes them."""
     batch = ring.sample(replay, key, agent.config.batch_size, agent.config.batch_length)

@@ -26,6 +26,7 @@ _NUM_SAMPLES = len(SAMPLES)
 _BLACK = Vec(0.0, 0.0, 0.0)
 
 
+@jax.named_scope("rendering")
 def draw(scene: Scene, data: Any, overrides: Overrides | None = None) -> Array:
     """One state's picture: uint8 [height, width, 3]. Pure; vmap it over states.
 

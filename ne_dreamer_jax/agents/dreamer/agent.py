@@ -158,7 +158,8 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         model, model_metrics = world_model.prediction_losses(
             nets, config.world_model, params, rollout, posterior, behavior.head_discount(config.behavior)
         )
-        representation, objective_metrics = objective.loss(params, state.target, objective_key, rollout)
+        with jax.named_scope("objective"):
+            representation, objective_metrics = objective.loss(params, state.target, objective_key, rollout)
         actor_critic, scale, behavior_metrics = behavior.actor_critic_losses(
             nets,
             config.behavior,
@@ -185,6 +186,7 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         metrics |= {"gradient_norm": optax.tree.norm(grads)} | what_is_not
         return guard.update_if(finite, descend, state, grads, scale, key), jax.lax.stop_gradient(latent), metrics
 
+    @jax.named_scope("optimizer")
     def descend(state: TrainState, grads: Params, scale: ReturnScale, key: Array) -> TrainState:
         updates, optimizer_state = optimizer.update(grads, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)

@@ -120,6 +120,7 @@ def imagination_noise(nets: Networks, key: Array, rows: int, horizon: int) -> No
     return jax.vmap(of_step)(jax.random.split(key, horizon))
 
 
+@jax.named_scope("imagination")
 def imagine(
     nets: Networks,
     params: Params,
@@ -176,6 +177,7 @@ class Judgement(NamedTuple):
     policy: Array | None  # float32 [..., outputs], the actor's with the state held fixed, where gradients pass states
 
 
+@jax.named_scope("behavior")
 def actor_critic_losses(
     nets: Networks,
     config: BehaviorConfig,

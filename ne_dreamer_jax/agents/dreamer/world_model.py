@@ -37,6 +37,7 @@ class WorldModelConfig:
         ranges.check(self)
 
 
+@jax.named_scope("posterior")
 def posterior_rollout(
     nets: Networks, params: Params, key: Array, batch: Batch, microbatches: int = 1
 ) -> tuple[Rollout, Array]:
@@ -77,6 +78,7 @@ def binary_cross_entropy(logit: Array, target: Array) -> Array:
     return -(target * jax.nn.log_sigmoid(logit) + (1 - target) * jax.nn.log_sigmoid(-logit))
 
 
+@jax.named_scope("predictions")
 def prediction_losses(
     nets: Networks, config: WorldModelConfig, params: Params, rollout: Rollout, posterior: Array, discount: float
 ) -> tuple[dict[str, Array], Metrics]:

@@ -250,6 +250,7 @@ class Simulation:
         with _mjx_numerics():
             return mjx.fwd_velocity(self.model, mjx.fwd_position(self.model, data))
 
+    @jax.named_scope("physics")
     def advance(
         self, data: mjx.Data, control: Array, restart: Array, start: Start, fresh_forces: bool = False
     ) -> mjx.Data:

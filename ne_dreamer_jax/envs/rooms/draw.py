@@ -174,6 +174,7 @@ def balloon(a: Array, b: Array) -> Array:
 SYMBOLS: tuple[Silhouette, ...] = (disc, triangle, square, diamond, plus, hexagon, arch, saltire)
 
 
+@jax.named_scope("rendering")
 def draw(scene: Scene, shapes: tuple[Silhouette, ...], position: Array, yaw: Array, size: int) -> Array:
     """The picture, uint8 [size, size, 3]."""
     forward, right = heading(yaw)
