@@ -142,7 +142,7 @@ def find(directory: Path) -> list[Found]:
     """All runs under a directory that were evaluated, by path.
 
     Raises:
-      ValueError: there is none, or they are of different tasks.
+      ValueError: there is none.
     """
     from ne_dreamer_jax.config import Config
     from ne_dreamer_jax.runs import metrics
@@ -158,44 +158,48 @@ def find(directory: Path) -> list[Found]:
             found.append(Found(config, (steps, returns), float(of_random[-1]) if len(of_random) else None))
     if not found:
         raise ValueError(f"expected runs that have been evaluated under {directory}, got none")
-    tasks = sorted({run.config.env.task for run in found})
-    if len(tasks) > 1:
-        raise ValueError(f"expected runs of one task under {directory}, got {', '.join(tasks)}")
     return found
 
 
 def draw(found: Sequence[Found], path: Path) -> list[str]:
-    """Draws the figure; returns a table, one line a method: mean and range over seeds of the last evaluation."""
-    import numpy as np
-
+    """Draws the figure; returns a table of each task, a line a method: mean and range of its last evaluations."""
     from ne_dreamer_jax.runs import pictures, plots
 
-    by_method: dict[str, list[Found]] = {}
+    by_task: dict[str, dict[str, list[Found]]] = {}
     for run in found:
-        by_method.setdefault(run.config.method, []).append(run)
-    of_random = [run.random_return for run in found if run.random_return is not None]
-    random_return = float(np.mean(of_random)) if of_random else None
-    task = found[0].config.env.task
-    curves = {method: [run.curve for run in runs] for method, runs in by_method.items()}
-    env_steps, others = max(run.config.loop.env_steps for run in found), published(task)
+        by_task.setdefault(run.config.env.task, {}).setdefault(run.config.method, []).append(run)
+    tasks, lines = [], []
+    for task, by_method in sorted(by_task.items()):
+        runs = [run for of_method in by_method.values() for run in of_method]
+        random_return = mean([run.random_return for run in runs if run.random_return is not None])
+        curves = {method: [run.curve for run in of_method] for method, of_method in by_method.items()}
+        env_steps = max(run.config.loop.env_steps for run in runs)
+        tasks.append(plots.Task(task, curves, env_steps, random_return, published(task)))
+        lines += [*_table(task, by_method), *([] if random_return is None else [_line("random policy", random_return)])]
     failed: list[str] = []
-    pictures.attempt(
-        lambda: plots.comparison(
-            curves, path, title=task, env_steps=env_steps, random_return=random_return, published=others
-        ),
-        path,
-        failed.append,
-    )
+    pictures.attempt(lambda: plots.comparison(tasks, path), path, failed.append)
+    return [*lines, *(failed or [f"  {path}"])]
+
+
+def _table(task: str, by_method: Mapping[str, Sequence[Found]]) -> list[str]:
+    """What the methods came to on a task."""
     lines = [f"{task}: return of the last evaluation, mean over seeds (lowest to highest)"]
     for method, runs in by_method.items():
         last = [float(run.curve[1][-1]) for run in runs]
         unfinished = sum(run.curve[0][-1] < run.config.loop.env_steps for run in runs)
         note = f", {unfinished} unfinished" if unfinished else ""
         seeds = f"{len(last)} seed{'s' * (len(last) > 1)}{note}"
-        lines.append(f"  {method:28} {np.mean(last):8.1f} ({min(last):.1f} to {max(last):.1f}), {seeds}")
-    if random_return is not None:
-        lines.append(f"  {'random policy':28} {random_return:8.1f}")
-    return [*lines, *(failed or [f"  {path}"])]
+        lines.append(f"{_line(method, sum(last) / len(last))} ({min(last):.1f} to {max(last):.1f}), {seeds}")
+    return lines
+
+
+def _line(name: str, value: float) -> str:
+    return f"  {name:28} {value:8.1f}"
+
+
+def mean(values: Sequence[float]) -> float | None:
+    """None where there are none."""
+    return sum(values) / len(values) if values else None
 
 
 def published(task: str) -> Mapping[str, Curve]:
@@ -218,7 +222,8 @@ main = command(
 
     Each run is kept in DIRECTORY/METHOD/seedN; those that are finished are not run again, and one that was stopped goes
     on. DIRECTORY/comparison.png shows evaluation returns, with a random policy's and, for DeepMind Control, the
-    published returns of DreamerV3 and DrQ-v2 from pixels.
+    published returns of DreamerV3 and DrQ-v2 from pixels. With --draw DIRECTORY may hold runs of several tasks, such as
+    those of experiments.sweep, wherever in it they lie: each task has a part of the figure.
     """,
 )
 

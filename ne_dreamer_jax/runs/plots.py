@@ -13,7 +13,7 @@ import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Curve = tuple[np.ndarray, np.ndarray]
+"""Environment steps ``[n]``, and returns ``[n]`` there."""
 TRAIN, EVALUATION, RANDOM = "#0072b2", "#d55e00", "#666666"  # of the Okabe-Ito palette: apart for every eye
 METHODS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8b5a2b", "#999999", "#000000")
 
@@ -59,47 +61,78 @@ def learning_curve(
             axes.text(0.5, 0.5, "no episode has ended yet", transform=axes.transAxes, ha="center", color=RANDOM)
 
 
-def comparison(
-    curves: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]],
-    path: Path,
-    *,
-    title: str,
-    env_steps: int,
-    random_return: float | None = None,
-    published: Mapping[str, tuple[np.ndarray, np.ndarray]],
-) -> None:
-    """Draws evaluation returns of several methods into a PNG: each seed thin, the mean over seeds thick.
+class Task(NamedTuple):
+    """What is drawn of one task."""
+
+    title: str
+    curves: Mapping[str, Sequence[Curve]]  # method -> the evaluations of each seed
+    env_steps: int  # the runs' budget
+    random_return: float | None = None  # mean of a random policy's returns
+    published: Mapping[str, Curve] = {}  # label -> published returns
+
+
+def comparison(tasks: Sequence[Task], path: Path) -> None:
+    """Draws evaluation returns of several methods into a PNG, tasks beside each other.
+
+    Each seed is thin, the mean over seeds thick. A method has the same colour in all tasks. What is published within
+    the budget is drawn as a curve; if that is less than two points, the first one beyond it is drawn as a level.
 
     Args:
-      curves: method -> (environment steps ``[n]``, returns ``[n]``) of each seed.
+      tasks: at least one.
       path: of the PNG, replaced whole.
-      env_steps: the runs' budget.
-      random_return: mean of a random policy's returns.
-      published: label -> (environment steps, returns). What lies within the budget is drawn as a curve; if fewer than
-        two points do, the first point beyond it is drawn as a level.
     """
-    with _picture(path, 7.8, 4.6) as axes:
-        for color, (method, seeds) in zip(itertools.cycle(METHODS), curves.items(), strict=False):
-            for steps, returns in seeds:
-                axes.plot(steps, returns, color=color, lw=0.7, alpha=0.5)
-            label = f"{method} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
-            axes.plot(*mean_over_seeds(seeds), color=color, lw=2, marker="o", ms=3.5, label=label)
-        for style, (label, (steps, returns)) in zip(itertools.cycle((":", "-.")), published.items(), strict=False):
-            within = steps <= env_steps
-            if within.sum() > 1:
-                axes.plot(steps[within], returns[within], color="k", lw=1.2, ls=style, label=f"{label}, published")
-            else:
-                nearest = min(int(within.sum()), len(steps) - 1)
-                told = f"{label}, published, {steps[nearest]:,.0f} steps ({returns[nearest]:.3g})"
-                axes.axhline(returns[nearest], color="k", lw=1.2, ls=style, label=told)
-        if random_return is not None:
-            axes.axhline(random_return, color=RANDOM, lw=1.2, ls="--", label=f"random policy ({random_return:.3g})")
-        axes.set(title=title, xlabel="environment steps", ylabel="evaluation return", xlim=(0, env_steps))
-        _style(axes)
-        axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    methods = list(dict.fromkeys(method for task in tasks for method in task.curves))
+    colors = dict(zip(methods, itertools.cycle(METHODS), strict=False))
+    columns = min(len(tasks), 4)
+    rows = -(-len(tasks) // columns)
+    alone = len(tasks) == 1
+    with figure(*((7.8, 4.6) if alone else (3.0 * columns, 2.5 * rows + 0.4)), dpi=150) as empty:
+        panels = empty.subplots(rows, columns, squeeze=False).flatten()
+        for axes, task in zip(panels, tasks, strict=False):
+            _compare(axes, task, colors, full=alone)
+        for axes in panels[len(tasks) :]:
+            axes.set_axis_off()
+        if alone:
+            panels[0].legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        else:
+            handles = {
+                label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+            }
+            empty.supxlabel("environment steps", fontsize="medium")
+            empty.supylabel("evaluation return", fontsize="medium")
+            empty.legend(
+                handles.values(), handles, loc="outside upper center", ncols=min(5, len(handles)), frameon=False
+            )
+        save(empty, path)
 
 
-def mean_over_seeds(seeds: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _compare(axes: Axes, task: Task, colors: Mapping[str, str], full: bool) -> None:
+    """One task's curves; labels have numbers of seeds and returns where ``full``, and are names alone otherwise."""
+    for method, seeds in task.curves.items():
+        for steps, returns in seeds:
+            axes.plot(steps, returns, color=colors[method], lw=0.7, alpha=0.5)
+        label = f"{method} ({len(seeds)} seed{'s' * (len(seeds) > 1)})" if full else method
+        axes.plot(*mean_over_seeds(seeds), color=colors[method], lw=2, marker="o", ms=3.5, label=label)
+    for style, (name, (steps, returns)) in zip(itertools.cycle((":", "-.")), task.published.items(), strict=False):
+        within = steps <= task.env_steps
+        label = f"{name}, published"
+        if within.sum() > 1:
+            axes.plot(steps[within], returns[within], color="k", lw=1.2, ls=style, label=label)
+        else:
+            nearest = min(int(within.sum()), len(steps) - 1)
+            told = f"{label}, {steps[nearest]:,.0f} steps ({returns[nearest]:.3g})"
+            axes.axhline(returns[nearest], color="k", lw=1.2, ls=style, label=told if full else label)
+    if task.random_return is not None:
+        label = f"random policy ({task.random_return:.3g})" if full else "random policy"
+        axes.axhline(task.random_return, color=RANDOM, lw=1.2, ls="--", label=label)
+    axes.set_title(task.title, fontsize="large" if full else "medium")
+    axes.set_xlim(0, task.env_steps)
+    if full:
+        axes.set(xlabel="environment steps", ylabel="evaluation return")
+    _style(axes)
+
+
+def mean_over_seeds(seeds: Sequence[Curve]) -> Curve:
     """Environment steps that every seed was evaluated at, and the mean return there."""
     if not seeds:
         return np.zeros(0), np.zeros(0)

@@ -100,11 +100,19 @@ def test_the_ablations_are_the_papers(tmp_path, invoke):
     assert [name.replace("-", "/") for name, _ in started] == [n for n in names.METHODS if n.startswith("ne_dreamer")]
 
 
-def test_runs_of_different_tasks_are_refused(tmp_path, invoke):
+def test_runs_of_several_tasks_are_told_and_drawn_task_by_task(tmp_path, invoke):
     invoke(compare, tmp_path / "a", "--method", "r2dreamer", "--seeds", 1, "--task", "dmc/walker_walk")
-    code, output, _ = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1, "--task", "dmc/cheetah_run")
-    assert code == 2
-    assert "expected runs of one task" in " ".join(output.split())
+    invoke(compare, tmp_path / "b", "--method", "dreamerv3", "--seeds", 2, "--task", "dmc/cheetah_run")
+    code, output, _ = invoke(compare, tmp_path, "--draw")
+    assert code == 0
+    assert (tmp_path / "comparison.png").read_bytes()[1:4] == b"PNG"
+    cheetah, walker = output.split("dmc/cheetah_run: ")[1].split("dmc/walker_walk: ")
+    assert "r2dreamer" in walker
+    assert "dreamerv3" in cheetah
+    assert "r2dreamer" not in cheetah
+
+
+def test_where_no_run_is_that_is_said(tmp_path, invoke):
     code, output, _ = invoke(compare, tmp_path / "empty", "--draw")
     assert code == 2
     assert "got none" in " ".join(output.split())
@@ -129,7 +137,6 @@ def test_the_mean_is_over_the_steps_that_all_seeds_have():
 def test_budgets_short_and_long_are_drawn_beside_published_returns(tmp_path, env_steps):
     curve = (np.asarray([1e4, 3e4]), np.asarray([1.0, 2.0]))
     path = tmp_path / "x.png"
-    plots.comparison(
-        {"ne_dreamer": [curve]}, path, title="t", env_steps=env_steps, published=compare.published("dmc/walker_walk")
-    )
+    task = plots.Task("t", {"ne_dreamer": [curve]}, env_steps, published=compare.published("dmc/walker_walk"))
+    plots.comparison([task], path)
     assert path.stat().st_size > 10_000

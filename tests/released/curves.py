@@ -129,7 +129,7 @@ def main(out: Path, paths: tuple[Path, ...]) -> None:
             picture = out / f"{task}.png"
             curves = {label: [(run.steps, run.returns) for run in each] for label, each in by_label.items()}
             budget = runs[0].config.loop.env_steps
-            plots.comparison(curves, picture, title=f"{task}, from vectors", env_steps=budget, published={})
+            plots.comparison([plots.Task(f"{task}, from vectors", curves, budget)], picture)
             click.echo(f"{task}: {picture}")
             for line in table(by_label):
                 click.echo(line)
