@@ -21,7 +21,7 @@ def make(tmp_path, monkeypatch):
     (tmp_path / "made").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
-    def make(name: str, code: str, seconds: float = 1.0) -> stages.Stage:
+    def make(name: str, code: str, seconds: float = 20.0) -> stages.Stage:
         (tmp_path / "made" / f"{name}.py").write_text(code)
         return stages.Stage(name, f"made.{name}", (), seconds)
 
@@ -40,7 +40,7 @@ def test_results_and_failures_are_kept_and_printed(tmp_path, make, capsys):
             make("plain", "print('| 1 |')"),
             make("broken", "raise SystemExit('no memory')"),
             make("cut", 'print(\'{"benchmark": "a\')'),
-            make("slow", "import time; print('begun', flush=True); time.sleep(100)", 0.5),
+            make("slow", "import time; print('begun', flush=True); time.sleep(100)", 2.0),
         ],
         out,
         minutes=2,
@@ -104,7 +104,7 @@ def test_a_stage_ends_with_the_process_that_began_it(tmp_path, make, number):
     script = f"""
 from pathlib import Path
 from benchmarks.stages import Stage, run
-run([Stage("slow", "made.slow", (), 1.0)], Path({str(out)!r}), float("inf"))
+run([Stage("slow", "made.slow", (), 20.0)], Path({str(out)!r}), float("inf"))
 """
     path = os.pathsep.join([str(tmp_path), str(Path(stages.__file__).parents[1])])
     process = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path})
