@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from ne_dreamer_jax.envs import registry
@@ -155,6 +155,13 @@ def for_task(task: str, like: Any) -> Any:
         known |= {"action_repeat", "obs"}
     shared = {field.name: getattr(like, field.name) for field in fields(like) if field.name in known}
     return kind(**{**shared, "task": task})
+
+
+def with_images(config: Any) -> Any:
+    """The settings of the same environment with images beside its vectors, or ``config`` itself if there are none."""
+    if isinstance(config, _SAME_CONTROL) and config.obs == "vector":
+        return replace(config, obs="both")
+    return config
 
 
 def make(config: Any) -> Any:

@@ -68,6 +68,7 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
     """A function that plays episodes in these environments with this agent.
 
     Args:
+      env: observes at least what the agent does; images that it does not see are for the frames alone.
       max_steps: agent steps after which an episode that has not ended is left; `Evaluation.unfinished` counts those.
       chunk_steps: vector steps of one call to the device.
     """
@@ -79,7 +80,7 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
     def play(
         params: Any, key: Array, episodes: int, random: bool = False, frames: bool = False, steps: bool = False
     ) -> Evaluation:
-        frames = frames and bool(images_of(agent.spec))
+        frames = frames and bool(images_of(env.spec))
         carry, clips, seen = begin(env, agent, key, episodes), [], []
         for _ in range(-(-(max_steps + 1) // chunk_steps)):
             carry, (clip, kept) = run(params, carry, jnp.asarray(random), frames=frames, steps=steps)
@@ -139,7 +140,8 @@ def _run(
 
     def step(carry: Playing, _: None) -> tuple[Playing, tuple[Any, Any]]:
         key, act_key, random_key = jax.random.split(carry.key, 3)
-        env_state, timestep = env.step(carry.env, carry.policy.prev_action)
+        env_state, shown = env.step(carry.env, carry.policy.prev_action)
+        timestep = shown._replace(obs={name: shown.obs[name] for name in agent.spec.observation})
         policy, action = agent.act(params, carry.policy, timestep, act_key, mode="mode")
         action = jnp.where(random, random_action(agent.spec.action, random_key, action.shape[0]), action)
         policy = policy._replace(prev_action=action)
@@ -153,7 +155,7 @@ def _run(
             complete=jnp.where(counts, cuts.faults + cuts.bad_actions == 0, carry.complete),
             done=carry.done | timestep.is_last,
         )
-        clip = (timestep.obs[next(iter(images_of(agent.spec)))][0], counts[0]) if frames else None
+        clip = (shown.obs[next(iter(images_of(env.spec)))][0], counts[0]) if frames else None
         kept = Steps(dict(timestep.obs), action, timestep.reward, policy.latent, counts) if steps else None
         return new, (clip, kept)
 

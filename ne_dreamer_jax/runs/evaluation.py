@@ -82,7 +82,8 @@ def evaluate(
       run, env, prefer: as for `load`, with its errors.
       episodes: M, played together.
       seed: of the episodes' beginnings.
-      with_video: whether to write the first episode to ``policy.mp4``.
+      with_video: whether to write the first episode to ``policy.mp4``. Where the agent sees vectors alone, DeepMind
+        Control's tasks are drawn for that.
       also: name of an environment to play as many episodes in, too: another with the same observations and actions.
       echo: takes the lines for people.
 
@@ -97,6 +98,8 @@ def evaluate(
         processes fail.
     """
     loaded = load(run, env, prefer)
+    if with_video and env is None:
+        loaded = _with_images(loaded)
     venv, other = as_vector(loaded.env), None
     try:
         other = None if also is None else _other(also, loaded)
@@ -140,6 +143,17 @@ def _evaluate(
         content["also"] = {"task": also} | _play_also(also, other, loaded, episodes, seed, echo)
     run_directory.write_evaluation(files, content)
     return content
+
+
+def _with_images(loaded: Loaded) -> Loaded:
+    """With an environment that has images, too, where there is such a setting; the agent does not see them."""
+    config = env_configs.with_images(loaded.config.env)
+    if config == loaded.config.env:
+        return loaded
+    replaced = as_vector(loaded.env)
+    if replaced.host is not None:
+        replaced.host.close()
+    return loaded._replace(env=env_configs.make(config))
 
 
 def _other(task: str, loaded: Loaded) -> VectorEnv:
@@ -214,7 +228,7 @@ def _video(
     evaluation: Evaluation, files: RunDirectory, step_seconds: float | None, echo: Callable[[str], None]
 ) -> None:
     if evaluation.frames is None:
-        echo("no video: this agent sees vectors, not pixels")
+        echo("no video: this environment has no images")
         return
     write = lambda: video.write(evaluation.frames, files.video, fps=video.frame_rate(step_seconds))
     if pictures.attempt(write, files.video, echo):

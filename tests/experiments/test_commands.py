@@ -199,7 +199,7 @@ def test_evaluate_plays_a_stored_policy_beside_a_random_one(trained, monkeypatch
     first = (trained / "evaluation.json").read_text()
     play_as(monkeypatch, stub.build(toy.config(), image=False))
     _, output = invoke(evaluate, trained, "--episodes", 3, "--video", "--checkpoint", which)
-    assert "no video: this agent sees vectors" in output
+    assert "no video: this environment has no images" in output
     assert (trained / "evaluation.json").read_text() == first  # the same seed, the same episodes
 
 

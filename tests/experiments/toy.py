@@ -46,8 +46,8 @@ def config(**loop) -> Config:
     return replace(smoke, env=env, agent=agent, loop=replace(smoke.loop, **(settings | loop)))
 
 
-def env() -> base.Env:
-    """A point on a line; the reward is minus its distance from 0."""
+def env(image: bool = False) -> base.Env:
+    """A point on a line; the reward is minus its distance from 0. An image would show nothing of it."""
 
     def reset(key: Array):
         return jax.random.normal(key), jnp.zeros((), jnp.int32)
@@ -59,7 +59,11 @@ def env() -> base.Env:
         progress = base.Progress(-jnp.abs(position), last, jnp.zeros((), bool), jnp.ones((), bool))
         return (position, time + 1), progress
 
-    spec = EnvSpec({"position": ArraySpec((1,), jnp.float32)}, ContinuousAction(1))
+    blank = {"image": jnp.zeros((4, 4, 3), jnp.uint8)} if image else {}
+    observation = {"position": ArraySpec((1,), jnp.float32)} | {
+        name: ArraySpec(x.shape, x.dtype) for name, x in blank.items()
+    }
+    spec = EnvSpec(observation, ContinuousAction(1))
     return base.from_core(
-        base.Core(spec, reset, base.restart_or_step(reset, step), lambda state: {"position": state[0][None]})
+        base.Core(spec, reset, base.restart_or_step(reset, step), lambda state: {"position": state[0][None]} | blank)
     )

@@ -13,7 +13,8 @@ import pytest
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import envs
 from ne_dreamer_jax.envs import base, registry
-from ne_dreamer_jax.envs.config import GIVEN, DmcConfig, OwnConfig
+from ne_dreamer_jax.envs.config import GIVEN, DmcConfig, OwnConfig, RoomsConfig, with_images
+from ne_dreamer_jax.envs.vector import as_vector
 from ne_dreamer_jax.runs.run_directory import RefusedError
 from tests.experiments import toy
 
@@ -171,6 +172,25 @@ def test_play_keeps_what_was_seen_and_done(given):
     assert not steps.counts[toy.LENGTH + 1 :].any()
     np.testing.assert_allclose((steps.reward * steps.counts).sum(0), played.returns, rtol=1e-6)
     assert steps.latent.deter.shape[:2] == steps.action.shape[:2] == steps.counts.shape
+
+
+def test_images_that_the_agent_does_not_see_are_for_the_frames_alone(given):
+    path, _ = given
+    loaded = nedreamer.load(path, env=toy.env())
+    play = lambda env: nedreamer.loop.make_play(as_vector(env), loaded.agent, max_steps=50, chunk_steps=4)(
+        loaded.state.params, jax.random.key(0), 3, frames=True, steps=True
+    )
+    plain, shown = play(loaded.env), play(toy.env(image=True))
+    assert plain.frames is None
+    assert shown.frames.shape == (toy.LENGTH + 1, 4, 4, 3)
+    np.testing.assert_array_equal(shown.returns, plain.returns)
+    assert set(shown.steps.obs) == set(plain.steps.obs)
+
+
+def test_vectors_of_dmc_are_drawn_for_a_video():
+    assert with_images(DmcConfig(obs="vector", image_size=32)) == DmcConfig(obs="both", image_size=32)
+    for same in (DmcConfig(), RoomsConfig()):
+        assert with_images(same) is same
 
 
 @pytest.mark.parametrize(
