@@ -158,9 +158,12 @@ def for_task(task: str, like: Any) -> Any:
 
 
 def with_images(config: Any) -> Any:
-    """The settings of the same environment with images beside its vectors, or ``config`` itself if there are none."""
+    """The settings of the same environment with images of 64 x 64 or more beside its vectors, for people to look at.
+
+    ``config`` itself where it has images, or no setting makes them.
+    """
     if isinstance(config, _SAME_CONTROL) and config.obs == "vector":
-        return replace(config, obs="both")
+        return replace(config, obs="both", image_size=max(64, config.image_size))
     return config
 
 

@@ -188,7 +188,8 @@ def test_images_that_the_agent_does_not_see_are_for_the_frames_alone(given):
 
 
 def test_vectors_of_dmc_are_drawn_for_a_video():
-    assert with_images(DmcConfig(obs="vector", image_size=32)) == DmcConfig(obs="both", image_size=32)
+    assert with_images(DmcConfig(obs="vector", image_size=32)) == DmcConfig(obs="both", image_size=64)
+    assert with_images(DmcConfig(obs="vector", image_size=96)) == DmcConfig(obs="both", image_size=96)
     for same in (DmcConfig(), RoomsConfig()):
         assert with_images(same) is same
 
