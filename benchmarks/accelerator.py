@@ -125,7 +125,7 @@ def _finite(_: click.Context, parameter: click.Parameter, value: float) -> float
 )
 @click.option(
     "--smallest", is_flag=True, help="All as small as it goes and however long it takes, to see that it runs on a CPU."
-)  # fmt: skip
+)
 def main(output: Path, minutes: float, smallest: bool) -> None:
     """Run the benchmarks that tell of an accelerator, the most important first; print and keep what they print.
 

@@ -7,6 +7,7 @@ of its own, and draws all of it into one figure.
 from __future__ import annotations
 
 import csv
+import statistics
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -23,13 +24,11 @@ from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ne_dreamer_jax.config import Config
+    from ne_dreamer_jax.runs.plots import Curve
 
 PUBLISHED = Path(__file__).parent / "reference" / "dmc_vision_published.csv"
 LABELS = {"dreamerv3": "DreamerV3", "drqv2": "DrQ-v2"}
-Curve = tuple["np.ndarray", "np.ndarray"]
 
 
 REFUSED = 2
@@ -171,7 +170,8 @@ def draw(found: Sequence[Found], path: Path) -> list[str]:
     tasks, lines = [], []
     for task, by_method in sorted(by_task.items()):
         runs = [run for of_method in by_method.values() for run in of_method]
-        random_return = mean([run.random_return for run in runs if run.random_return is not None])
+        of_random = [run.random_return for run in runs if run.random_return is not None]
+        random_return = statistics.fmean(of_random) if of_random else None
         curves = {method: [run.curve for run in of_method] for method, of_method in by_method.items()}
         env_steps = max(run.config.loop.env_steps for run in runs)
         tasks.append(plots.Task(task, curves, env_steps, random_return, published(task)))
@@ -189,17 +189,12 @@ def _table(task: str, by_method: Mapping[str, Sequence[Found]]) -> list[str]:
         unfinished = sum(run.curve[0][-1] < run.config.loop.env_steps for run in runs)
         note = f", {unfinished} unfinished" if unfinished else ""
         seeds = f"{len(last)} seed{'s' * (len(last) > 1)}{note}"
-        lines.append(f"{_line(method, sum(last) / len(last))} ({min(last):.1f} to {max(last):.1f}), {seeds}")
+        lines.append(f"{_line(method, statistics.fmean(last))} ({min(last):.1f} to {max(last):.1f}), {seeds}")
     return lines
 
 
 def _line(name: str, value: float) -> str:
     return f"  {name:28} {value:8.1f}"
-
-
-def mean(values: Sequence[float]) -> float | None:
-    """None where there are none."""
-    return sum(values) / len(values) if values else None
 
 
 def published(task: str) -> Mapping[str, Curve]:

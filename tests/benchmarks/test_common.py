@@ -42,6 +42,13 @@ def test_last_line_of_a_report_is_json_with_all_figures(capsys):
     assert "frames/s" not in slow
 
 
+def test_a_report_says_how_much_memory_a_device_has_held(monkeypatch, capsys):
+    monkeypatch.setattr(common, "peak_bytes", lambda: 3_000_000_000)
+    measured = common.measure({"a": lambda: jnp.ones(1)}, rounds=1)
+    assert common.report("demo", measured, settings={})["peak_bytes"] == 3_000_000_000
+    assert "at most 3 GB of the device's memory" in capsys.readouterr().out
+
+
 def test_table_aligns_columns_and_marks_what_is_missing():
     rows = [{"case": "a", "seconds": 1.23456}, {"case": "long name", "seconds": 10.0, "n": 2}]
     assert common.table(rows).splitlines() == [
