@@ -139,7 +139,7 @@ def rooms_small(size: str) -> Config:
     agent = replace(
         small,
         encoder=replace(small.encoder, multipliers=(2, 3, 4)),
-        behavior=BehaviorConfig(horizon=8, discount=0.98, entropy=1e-3),
+        behavior=BehaviorConfig(horizon=8, discount=0.98, discount_in_head=True, entropy=1e-3),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup=100),
     )
     loop = LoopConfig(env_steps=320_000, replay_ratio=32.0, prefill=2_000, eval_every=32_000, eval_episodes=32)
@@ -169,7 +169,7 @@ def released_code(size: str) -> Config:
         base,
         heads=replace(base.heads, clip_actions=False),
         world_model=WorldModelConfig(kl_unimix=0.0),
-        behavior=BehaviorConfig(discount=1 - 1 / 333, discount_in_head=False, percentile_method="nearest"),
+        behavior=BehaviorConfig(discount=1 - 1 / 333, percentile_method="nearest"),
         objective=NextEmbedding(
             PredictorConfig(discrete_action="normalised", attention_init="xavier"),
             sample_deviation=True,

@@ -109,7 +109,7 @@ def oracle(reinforce):
     """Time first, as they were imagined."""
     heads = reinforce.heads
     reward, value, slow = mean_of(heads["reward"]), mean_of(heads["critic"]), mean_of(heads["slow"])
-    go_on = 1 / (1 + np.exp(-np.asarray(heads["continue"][..., 0], np.float64)))  # the discount is inside
+    go_on = CONFIG.discount / (1 + np.exp(-np.asarray(heads["continue"][..., 0], np.float64)))
     returns = [value[H]]
     for t in reversed(range(H)):
         returns.insert(0, reward[t + 1] + go_on[t + 1] * ((1 - 0.8) * value[t + 1] + 0.8 * returns[0]))
@@ -184,7 +184,7 @@ def test_the_score_functions_gradient_is_that_of_one_batched_actor_on_frozen_tra
         time_last = lambda x: jnp.swapaxes(x, 0, 1)
         bins = symexp_bins(15)
         mean = lambda head: time_last(twohot_mean(nets.apply(head, params, features), bins))
-        go_on = time_last(jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0]))
+        go_on = CONFIG.discount * time_last(jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0]))
         returns = lambda_returns(mean("reward"), mean("critic"), go_on, CONFIG.lam)
         low, high = update_percentiles(*OLD_SCALE, returns, CONFIG.return_decay, CONFIG.return_percentiles)
         advantage = (returns - mean("critic")[:, :-1]) / return_scale(low, high)
@@ -237,7 +237,7 @@ def test_the_entropys_gradient_stops_at_its_own_state():
         ]
         _, (_, rollout) = model.compute(params, model.slow, model.batch, KEY)
         _, _, features = frozen_trajectory(nets, params, rollout, KEY)
-        go_on = jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0])
+        go_on = CONFIG.discount * jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0])
 
         def loss(actor):
             distribution = policy(nets.heads, tiny.VECTORS.action, nets.apply("actor", {"actor": actor}, features[:-1]))
@@ -258,7 +258,7 @@ def test_returns_are_normalised_by_no_less_than_the_floor():
 
 def test_the_discount_is_in_the_head_or_multiplied_outside():
     """Both say gamma times the probability of going on, once each head has learned what it is trained towards."""
-    inside, outside = CONFIG, replace(CONFIG, discount_in_head=False)
+    inside, outside = replace(CONFIG, discount_in_head=True), CONFIG
     assert (behavior.head_discount(inside), behavior.head_discount(outside)) == (0.9, 1.0)
     for probability in (0.0, 0.3, 0.999):
         learned = jnp.array([[0.9 * probability], [probability]], jnp.float32)

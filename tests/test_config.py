@@ -200,7 +200,6 @@ def test_the_released_code_differs_where_fidelity_says_so():
         "loop.capacity": 500_000,
         "loop.write_latents": False,
         "loop.prefill": 1_056,
-        "agent.behavior.discount_in_head": False,
         "agent.behavior.discount": 1 - 1 / 333,
     }
     fidelity = (Path(__file__).parents[1] / "experiments" / "FIDELITY.md").read_text()
@@ -301,7 +300,7 @@ CHANGES = {
         "horizon": "2",
         "imagine_last": "3",
         "discount": "0.85",
-        "discount_in_head": "false",
+        "discount_in_head": "true",
         "lam": "0.9",
         "entropy": "0.1",
         "entropy_final": "0.01",

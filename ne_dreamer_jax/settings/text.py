@@ -19,6 +19,8 @@ from ne_dreamer_jax.settings import ranges
 
 T = TypeVar("T")
 TAG = "type"  # the key of the class name in JSON, where a field may hold one of several dataclasses
+BEFORE = "before"
+"""Key of a dataclass field's metadata: what data without the field means, where that is not the field's default."""
 
 
 def nearest(word: str, known: Iterable[str], count: int = 3) -> list[str]:
@@ -78,7 +80,8 @@ def to_dict(config: Any) -> dict[str, Any]:
 def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
     """What `to_dict` gave, as a configuration again.
 
-    A field that is missing has its default: an older version, which had no such field, wrote the data.
+    A field that is missing has its default, or the value under `BEFORE` in its metadata: an older version, which had no
+    such field, wrote the data.
 
     Raises:
       ValueError: an unknown field, a missing one without a default, or a value that does not fit its annotation.
@@ -266,7 +269,12 @@ def _decode_one(annotation: Any, data: Any, path: str, *, default: str | None, t
         missing, unknown = sorted(_required(annotation) - given.keys()), sorted(given.keys() - hints.keys())
         if missing or unknown:
             raise ValueError(f"{path}: expected the fields {sorted(hints)}; missing {missing}, unknown {unknown}")
-        return annotation(**{name: _decode(hints[name], given[name], f"{path}.{name}") for name in given})
+        before = {
+            field.name: field.metadata[BEFORE]
+            for field in dataclasses.fields(annotation)
+            if BEFORE in field.metadata and field.name not in given
+        }
+        return annotation(**before, **{name: _decode(hints[name], given[name], f"{path}.{name}") for name in given})
     if _is_mapping(annotation) and isinstance(data, Mapping):
         return {name: _decode(arguments[1], value, f"{path}.{name}") for name, value in data.items()}
     if origin is tuple and isinstance(data, list):

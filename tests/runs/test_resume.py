@@ -131,6 +131,9 @@ def test_a_run_of_an_older_version_goes_on_without_the_settings_it_did_not_know(
         content = json.loads(files.config.read_text())
     del content["sha256"], content["agent"]["behavior"]["discount_in_head"], content["loop"]["max_skipped"]
     files.config.write_text(json.dumps(content))
+    with pytest.raises(RefusedError, match=r"agent.behavior.discount_in_head: True, now False"):
+        resume.settle(tmp_path, config)  # such a run had the discount in the head
+    config = settings.override(config, "agent.behavior.discount_in_head=true")
     assert resume.settle(tmp_path, config) == config
     content["agent"]["behavior"]["discount_on_feet"] = 1
     files.config.write_text(json.dumps(content))

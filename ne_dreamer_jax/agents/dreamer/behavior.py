@@ -7,7 +7,7 @@ the continuation of state t + 1 were received on arrival at it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -29,7 +29,7 @@ from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.nets.rssm import RSSM, feature
-from ne_dreamer_jax.settings import ranges
+from ne_dreamer_jax.settings import BEFORE, ranges
 from ne_dreamer_jax.settings.ranges import LARGEST, Count, NonNegative, Positive, Range, Share, ShareBelowOne
 from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
 
@@ -50,7 +50,7 @@ class BehaviorConfig:
     imagination starts there, and the critic learns from replay there. None: at all T, and so for more than T."""
     discount: ShareBelowOne = 0.997
     """The paper's table prints 0.85, its code and DreamerV3 use 0.997 (1 - 1/333)."""
-    discount_in_head: bool = True
+    discount_in_head: bool = field(default=False, metadata={BEFORE: True})
     """Whether the continuation head is trained towards discount * (1 - terminal), as DreamerV3, or towards 1 - terminal
     with the discount multiplied outside, as in the paper's equations and the released code."""
     lam: Share = 0.95
