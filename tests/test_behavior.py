@@ -222,6 +222,38 @@ def test_the_dynamics_gradient_comes_through_the_world_model(spec):
     assert not np.allclose(*(g["actor"]["actor"]["out"]["kernel"] for g in (gradients, other)))
 
 
+@pytest.mark.parametrize("gradient", ["reinforce", "dynamics"])
+def test_the_penalty_on_means_draws_them_towards_zero_at_their_own_state(gradient):
+    penalty = 0.1
+    config = replace(CONFIG, gradient=gradient, mean_penalty=penalty)
+    model, without = make(tiny.VECTORS, config), make(tiny.VECTORS, replace(config, mean_penalty=0.0))
+    nets = model.nets
+
+    @jax.jit
+    def run(params):
+        gradients = lambda made: jax.grad(lambda p: made.compute(p, made.slow, made.batch, KEY)[0]["actor"])(params)
+        _, (_, rollout) = model.compute(params, model.slow, model.batch, KEY)
+        _, _, features = frozen_trajectory(nets, params, rollout, KEY)
+        go_on = CONFIG.discount * jax.nn.sigmoid(nets.apply("continue", params, features)[..., 0])
+
+        def loss(actor):
+            mean, _ = jnp.split(nets.apply("actor", {"actor": actor}, features[:-1]), 2, axis=-1)
+            return penalty * jnp.mean(jnp.cumprod(go_on, axis=0)[:-1, :, None] * jnp.square(mean)) * mean.shape[-1]
+
+        return jax.tree.map(jnp.subtract, gradients(model), gradients(without)), jax.grad(loss)(params["actor"])
+
+    got, want = run(model.params)
+    assert set(trained({"actor": got})["actor"]) == {"actor"}
+    for x, y in zip(jax.tree.leaves(got["actor"]), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-2, atol=1e-3 * np.abs(y).max())
+
+
+def test_a_discrete_policy_has_no_means_to_penalise():
+    model, without = (make(tiny.DISCRETE, replace(CONFIG, mean_penalty=x)) for x in (1.0, 0.0))
+    losses = [jax.jit(lambda m=m: m.compute(m.params, m.slow, m.batch, KEY)[1][0][0])() for m in (model, without)]
+    assert losses[0] == losses[1]
+
+
 def test_the_entropys_gradient_stops_at_its_own_state():
     """Also where the actor is trained through the world model: more entropy later is no reason for an action now."""
     scale = 0.1

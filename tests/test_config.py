@@ -305,6 +305,7 @@ CHANGES = {
         "entropy": "0.1",
         "entropy_final": "0.01",
         "entropy_updates": "7",
+        "mean_penalty": "0.1",
         "gradient": "dynamics",
         "slow_scale": "0.5",
         "return_decay": "0.9",

@@ -152,6 +152,16 @@ def policy(config: HeadsConfig, action: ActionSpec, outputs: Array) -> BoundedNo
     return BoundedNormal(jnp.tanh(mean), config.min_std + (config.max_std - config.min_std) * jax.nn.sigmoid(std + 2.0))
 
 
+def squared_means(action: ActionSpec, outputs: Array) -> Array:
+    """Squares [...] of the normals' means before their tanh, summed over A; zeros where actions are discrete.
+
+    ``outputs`` [..., 2A] (or [..., A] where discrete) are the actor head's.
+    """
+    if isinstance(action, DiscreteAction):
+        return jnp.zeros(outputs.shape[:-1], outputs.dtype)
+    return jnp.sum(jnp.square(outputs[..., : action.size]), axis=-1)
+
+
 def policy_noise(action: ActionSpec, key: Array, shape: tuple[int, ...]) -> Array:
     """What samples of policies of this shape are made of: normal [*shape, A], or uniform [*shape] where discrete."""
     if isinstance(action, DiscreteAction):

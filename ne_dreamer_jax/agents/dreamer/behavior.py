@@ -24,7 +24,7 @@ from ne_dreamer_jax.losses import (
     twohot_mean,
     update_percentiles,
 )
-from ne_dreamer_jax.nets.heads import model_action, policy, policy_noise
+from ne_dreamer_jax.nets.heads import model_action, policy, policy_noise, squared_means
 from ne_dreamer_jax.nets.microbatches import in_microbatches
 from ne_dreamer_jax.nets.networks import Networks
 from ne_dreamer_jax.nets.rematerialise import keeping_products
@@ -62,6 +62,10 @@ class BehaviorConfig:
     paper and DreamerV3."""
     entropy_updates: Count = 10_000
     """Updates until `entropy_final`, where there is one. A forked run counts its parent's updates too."""
+    mean_penalty: NonNegative = 0.0
+    """Weight of the squares of the policy's means before their tanh, summed over a continuous action's components. It
+    keeps a policy from the ends of tanh, where next to no gradient reaches the actor. 0 as in the paper and DreamerV3;
+    discrete policies have no such means."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
@@ -248,6 +252,9 @@ def actor_critic_losses(
         advantage = (returns - value[:, :-1]) / divisor
         log_prob = distribution.log_prob(imagined.action).T
         actor = reinforce_loss(log_prob, advantage, entropy, weight, eta)
+    squares = squared_means(nets.spec.action, outputs).T
+    if config.mean_penalty:
+        actor = actor + config.mean_penalty * weight * squares
 
     critic = critic_loss(seen.logits, returns.T, seen.slow_value, weight.T, bins, config.slow_scale)  # [H, M]
     replay_critic = _replay_critic_loss(nets, config, params, slow_value, replayed, returns[:, 0])
@@ -258,6 +265,7 @@ def actor_critic_losses(
         "imagined/value": jnp.mean(value),
         "imagined/return_scale": divisor,
         "policy/entropy": jnp.mean(entropy),
+        "policy/squared_means": jnp.mean(squares),
     }
     if config.entropy_final is not None:
         metrics["policy/entropy_scale"] = eta
