@@ -64,8 +64,8 @@ class BehaviorConfig:
     """Updates until `entropy_final`, where there is one. A forked run counts its parent's updates too."""
     mean_penalty: NonNegative = 0.0
     """Weight of the squares of the policy's means before their tanh, summed over a continuous action's components. It
-    keeps a policy from the ends of tanh, where next to no gradient reaches the actor. 0 as in the paper and DreamerV3;
-    discrete policies have no such means."""
+    keeps a policy from the ends of tanh, where next to no gradient reaches the actor (rlkit's soft actor-critic has it,
+    at 1e-3). 0 as in the paper and DreamerV3; discrete policies have no such means."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
