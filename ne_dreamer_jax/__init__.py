@@ -24,6 +24,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "agents": ["Agent", "AgentConfig", "make_agent"],
         "envs": ["register"],
         "version": ["__version__"],
-        "runs": ["checkpoint", "evaluate", "load", "metrics", "run_directory", "train"],
+        "runs": ["checkpoint", "diagnose", "evaluate", "load", "metrics", "run_directory", "train"],
     },
 )

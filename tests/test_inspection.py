@@ -7,6 +7,7 @@ import pytest
 
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
+from ne_dreamer_jax.nets.rssm import feature
 from ne_dreamer_jax.types import ContinuousAction, EnvSpec, Latent, TimeStep
 from tests import tiny
 
@@ -45,6 +46,18 @@ def test_imagination_starts_where_it_is_told_and_its_heads_judge_its_features(ma
         np.testing.assert_allclose(value, seen, rtol=1e-4, atol=1e-5, err_msg=name)
     assert ((heads.discount > 0) & (heads.discount < 1)).all()
     np.testing.assert_array_equal(heads.reward, jnp.zeros((5, 2)))  # a fresh head's
+
+
+def test_an_open_loop_with_the_policys_actions_is_what_was_imagined(made):
+    agent, state = made
+    start = jax.tree.map(
+        lambda x: x[:, 0], agent.posterior(state.params, jax.random.key(1), tiny.batch(agent.spec)).latent
+    )
+    imagined = agent.imagine(state.params, jax.random.key(2), start, 4)
+    latents = agent.open_loop(state.params, jax.random.key(2), start, imagined.action)
+    np.testing.assert_allclose(feature(latents), imagined.feature[1:], rtol=1e-5, atol=1e-6)
+    others = agent.open_loop(state.params, jax.random.key(2), start, imagined.action[::-1])
+    assert not np.allclose(others.deter, latents.deter)
 
 
 def test_the_mode_of_the_heads_is_the_action_of_acting(made):

@@ -55,6 +55,9 @@ class Inspection(NamedTuple):
     """(params, key, batch) -> embeddings, latents and features along a batch [B, T, ...]."""
     imagine: Callable[[Params, Array, Latent, int], Imagined]
     """(params, key, latent [M, ...], horizon) -> what the model expects under the policy from these states."""
+    open_loop: Callable[[Params, Array, Latent, Array], Latent]
+    """(params, key, latent [M, ...], actions [H, M, ...], as an environment takes them) -> the latents [H, M, ...] that
+    the model expects after each, without a look at what came. With `imagine`'s key and actions they are its latents."""
     heads: Callable[[Params, Array], Heads]
     """(params, feature [..., F]) -> reward, discount, value and action."""
 
@@ -85,6 +88,11 @@ class Agent(NamedTuple):
     def imagine(self) -> Callable[[Params, Array, Latent, int], Imagined]:
         """`Inspection.imagine`, likewise."""
         return self._inspect().imagine
+
+    @property
+    def open_loop(self) -> Callable[[Params, Array, Latent, Array], Latent]:
+        """`Inspection.open_loop`, likewise."""
+        return self._inspect().open_loop
 
     @property
     def heads(self) -> Callable[[Params, Array], Heads]:

@@ -167,6 +167,11 @@ def with_images(config: Any) -> Any:
     return config
 
 
+def with_all(config: Any) -> Any:
+    """The settings of the same environment with images and vectors, where they have both; else ``config`` itself."""
+    return replace(with_images(config), obs="both") if isinstance(config, _SAME_CONTROL) else config
+
+
 def make(config: Any) -> Any:
     """The environment of these settings.
 

@@ -32,9 +32,10 @@ class Evaluation(NamedTuple):
 class Steps(NamedTuple):
     """What was seen and done, ``[steps, M, ...]``; meaningful where ``counts``."""
 
-    obs: Any  # name -> [steps, M, ...]
+    obs: Any  # name -> [steps, M, ...], also what the environment shows and the agent does not see
     action: Any  # taken from obs
     reward: Any  # float32 [steps, M], on arrival at obs
+    is_terminal: Any  # bool [steps, M], whether the episode ended there for good
     latent: Latent  # the posterior at obs
     counts: Any  # bool [steps, M], whether the step belongs to the episode
 
@@ -68,7 +69,7 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
     """A function that plays episodes in these environments with this agent.
 
     Args:
-      env: observes at least what the agent does; images that it does not see are for the frames alone.
+      env: observes at least what the agent does; what it does not see is for `Steps` and the frames alone.
       max_steps: agent steps after which an episode that has not ended is left; `Evaluation.unfinished` counts those.
       chunk_steps: vector steps of one call to the device.
     """
@@ -156,7 +157,7 @@ def _run(
             done=carry.done | timestep.is_last,
         )
         clip = (shown.obs[next(iter(images_of(env.spec)))][0], counts[0]) if frames else None
-        kept = Steps(dict(timestep.obs), action, timestep.reward, policy.latent, counts) if steps else None
+        kept = Steps(dict(shown.obs), action, shown.reward, shown.is_terminal, policy.latent, counts) if steps else None
         return new, (clip, kept)
 
     return jax.lax.scan(step, carry, None, length=length)

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submodules=[
         "api",
         "checkpoint",
+        "diagnosis",
         "evaluation",
         "fork",
         "metrics",
@@ -21,5 +22,5 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "training",
         "video",
     ],
-    submod_attrs={"api": ["Outcome", "train"], "evaluation": ["Loaded", "evaluate", "load"]},
+    submod_attrs={"api": ["Outcome", "train"], "diagnosis": ["diagnose"], "evaluation": ["Loaded", "evaluate", "load"]},
 )

@@ -156,6 +156,28 @@ def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
         save(empty, path)
 
 
+def filmstrips(rows: Mapping[str, np.ndarray], columns: Sequence[Sequence[str]], path: Path) -> None:
+    """Draws frames in rows into a PNG.
+
+    Args:
+      rows: name -> uint8 ``[n, H, W, C]``, with one or three channels.
+      columns: of each row, what is written above each of its frames.
+      path: of the PNG, replaced whole.
+    """
+    most = max(len(frames) for frames in rows.values())
+    with figure(1.1 * most + 0.6, 1.35 * len(rows), dpi=150) as empty:
+        grid = empty.subplots(len(rows), most, squeeze=False)
+        for axes, titles, (name, frames) in zip(grid, columns, rows.items(), strict=True):
+            for i, each in enumerate(axes):
+                each.set(xticks=[], yticks=[])
+                each.spines[:].set_visible(False)
+                if i < len(frames):
+                    each.imshow(frames[i].squeeze(), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+                    each.set_title(titles[i], fontsize=7)
+            axes[0].set_ylabel(name.strip(), fontsize=8)
+        save(empty, path)
+
+
 @contextlib.contextmanager
 def figure(width: float, height: float, dpi: int) -> Iterator[Figure]:
     """An empty figure in matplotlib's own style, drawn without a display. Sides are in inches."""

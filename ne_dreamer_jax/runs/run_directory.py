@@ -7,8 +7,10 @@
 ``metrics.jsonl``      see `ne_dreamer_jax.metrics`
 ``checkpoints/``       see `ne_dreamer_jax.checkpoint`
 ``evaluation.json``    what the last evaluation found
+``diagnosis.json``     what the last diagnosis found
 ``curve.png``          learning curves
 ``policy.mp4``         one evaluation episode
+``decoded.png``        frames, and what a decoder made after training draws of the latents
 =====================  ==================================================================
 
 The same configuration on the same directory goes on, wherever the directory was moved or copied to; another one (but
@@ -70,6 +72,16 @@ class RunDirectory(NamedTuple):
     def evaluation(self) -> Path:
         """Result of the last evaluation as JSON."""
         return self.path / "evaluation.json"
+
+    @property
+    def diagnosis(self) -> Path:
+        """Result of the last diagnosis as JSON."""
+        return self.path / "diagnosis.json"
+
+    @property
+    def decoded(self) -> Path:
+        """Frames, and what a decoder made after training draws of the latents."""
+        return self.path / "decoded.png"
 
     @property
     def curve(self) -> Path:
@@ -229,10 +241,19 @@ def write_parent(files: RunDirectory, origin: Mapping[str, Any]) -> None:
 
 def write_evaluation(files: RunDirectory, result: Mapping[str, Any]) -> None:
     """Stores what an evaluation found, in place of the one before. Raises RefusedError where that can't be written."""
+    _write_result(files.evaluation, result)
+
+
+def write_diagnosis(files: RunDirectory, result: Mapping[str, Any]) -> None:
+    """Stores what a diagnosis found, in place of the one before. Raises RefusedError where that can't be written."""
+    _write_result(files.diagnosis, result)
+
+
+def _write_result(path: Path, result: Mapping[str, Any]) -> None:
     try:
-        _write_json(files.evaluation, result)
+        _write_json(path, result)
     except OSError as error:
-        raise RefusedError(f"{files.evaluation} can't be written: {error.strerror or error}") from error
+        raise RefusedError(f"{path} can't be written: {error.strerror or error}") from error
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -20,9 +20,9 @@ from ne_dreamer_jax.agents.dreamer.world_model import WorldModelConfig
 from ne_dreamer_jax.agents.optim import OptimizerConfig
 from ne_dreamer_jax.losses.twohot import symexp_bins, twohot_mean
 from ne_dreamer_jax.nets.encoder import EncoderConfig
-from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, policy
+from ne_dreamer_jax.nets.heads import HeadsConfig, decode_action, encode_action, policy
 from ne_dreamer_jax.nets.networks import Networks
-from ne_dreamer_jax.nets.rssm import RSSMConfig, feature, initial_latent
+from ne_dreamer_jax.nets.rssm import RSSM, RSSMConfig, feature, initial_latent
 from ne_dreamer_jax.objectives import AnyObjective, Model, NextEmbedding
 from ne_dreamer_jax.settings import names, ranges
 from ne_dreamer_jax.settings.ranges import Count, NonNegative, Range
@@ -238,9 +238,20 @@ def inspection(config: AgentConfig, nets: Networks) -> Inspection:
         action = decode_action(nets.spec.action, trajectory.action, config.heads.clip_actions)
         return Imagined(features, action, heads(params, features))
 
+    def open_loop(params: Params, key: Array, latent: Latent, actions: Array) -> Latent:
+        encoded = encode_action(nets.spec.action, actions, config.heads.clip_actions)
+        noise = behavior.imagination_noise(nets, key, latent.deter.shape[0], actions.shape[0])
+
+        def step(latent: Latent, taken: tuple[Array, Array]) -> tuple[Latent, Latent]:
+            after: Any = nets.rssm.apply({"params": params["rssm"]}, latent, *taken, method=RSSM.imagine_step)
+            return after, after
+
+        return jax.lax.scan(step, latent, (encoded, noise.latent))[1]
+
     return Inspection(
         posterior=jax.jit(in_32_bits(posterior)),
         imagine=jax.jit(in_32_bits(imagine), static_argnums=3),
+        open_loop=jax.jit(in_32_bits(open_loop)),
         heads=jax.jit(in_32_bits(heads)),
     )
 
