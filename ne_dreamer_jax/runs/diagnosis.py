@@ -23,7 +23,6 @@ import optax
 
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.envs import config as env_configs
-from ne_dreamer_jax.envs.config import OwnConfig
 from ne_dreamer_jax.envs.vector import as_vector
 from ne_dreamer_jax.loop.play import Steps, make_play
 from ne_dreamer_jax.losses import image_loss
@@ -76,6 +75,7 @@ def diagnose(
     if agent.inspection is None:
         raise ValueError(f"{run}: expected a run of an agent with a world model, got {agent.config.method}")
     play_key, loop_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
+    loaded = evaluation.in_env(loaded, env_configs.with_all(loaded.config.env))
     steps, returns = _play(loaded, play_key, episodes)
     told: dict[str, Any] = {"updates": int(loaded.state.update), "episodes": episodes}
     told["return"] = float(np.mean(returns))
@@ -110,15 +110,13 @@ def diagnose(
 
 
 def _play(loaded: evaluation.Loaded, key: Array, episodes: int) -> tuple[Steps, np.ndarray]:
-    config = loaded.config.env
-    env = loaded.env if isinstance(config, OwnConfig) else env_configs.make(env_configs.with_all(config))
-    vector_env = as_vector(env)
+    env = as_vector(loaded.env)
     try:
-        play = make_play(vector_env, loaded.agent, loaded.config.loop.eval_max_steps)
+        play = make_play(env, loaded.agent, loaded.config.loop.eval_max_steps)
         played = play(loaded.state.params, key, episodes, steps=True)
     finally:
-        if vector_env.host is not None:
-            vector_env.host.close()
+        if env.host is not None:
+            env.host.close()
     return played.steps, np.asarray(played.returns)
 
 

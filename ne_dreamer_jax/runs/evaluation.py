@@ -13,7 +13,7 @@ from ne_dreamer_jax.agents import make_agent
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.envs import config as env_configs
-from ne_dreamer_jax.envs.config import OwnConfig
+from ne_dreamer_jax.envs.config import EnvConfig, OwnConfig
 from ne_dreamer_jax.envs.vector import VectorEnv, as_vector, check_env
 from ne_dreamer_jax.loop.play import Evaluation, make_play
 from ne_dreamer_jax.runs import checkpoint, pictures, run_directory, video
@@ -99,7 +99,7 @@ def evaluate(
     """
     loaded = load(run, env, prefer)
     if with_video and env is None:
-        loaded = _with_images(loaded)
+        loaded = in_env(loaded, env_configs.with_images(loaded.config.env))  # the agent does not see them
     venv, other = as_vector(loaded.env), None
     try:
         other = None if also is None else _other(also, loaded)
@@ -145,9 +145,8 @@ def _evaluate(
     return content
 
 
-def _with_images(loaded: Loaded) -> Loaded:
-    """With an environment that has images, too, where there is such a setting; the agent does not see them."""
-    config = env_configs.with_images(loaded.config.env)
+def in_env(loaded: Loaded, config: EnvConfig) -> Loaded:
+    """With an environment of these settings, which shows at least what the agent sees, in place of its own."""
     if config == loaded.config.env:
         return loaded
     replaced = as_vector(loaded.env)
