@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Literal
 
 import click
 
-from ne_dreamer_jax.commands.options import UserPath, find_devices, refusing, say
+from ne_dreamer_jax.commands.options import Run, find_devices, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.argument("logdir", type=UserPath(), metavar="DIRECTORY")
+@click.argument("logdir", type=Run(), metavar="DIRECTORY")
 @click.option("--episodes", type=click.IntRange(2), default=16, show_default=True, help="Half of them are fitted to.")
 @click.option(
     "--horizon", type=click.IntRange(1, 10_000), default=15, show_default=True, help="Steps that the model predicts."
@@ -46,10 +45,6 @@ def main(
     printed and written to diagnosis.json in DIRECTORY. Where there are images, decoded.png shows frames, and what a
     decoder that was trained afterwards draws of the latents and of the model's predictions.
     """
-    if not os.path.exists(run_directory.RunDirectory(logdir).marker):  # False for what can be no path, too
-        raise click.UsageError(
-            f"expected the --logdir of a run, got {logdir}: there is no {run_directory.MARKER} in it"
-        )
     quiet()
     from ne_dreamer_jax.runs import checkpoint, diagnosis
     from ne_dreamer_jax.system import compile_cache

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Literal
 
 import click
 
-from ne_dreamer_jax.commands.options import Task, UserPath, find_devices, refusing, say
+from ne_dreamer_jax.commands.options import Run, Task, find_devices, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.system.quiet import quiet
 
 
 @click.command(context_settings={"max_content_width": 110})
-@click.argument("logdir", type=UserPath(), metavar="DIRECTORY")
+@click.argument("logdir", type=Run(), metavar="DIRECTORY")
 @click.option("--episodes", type=click.IntRange(1), default=10, show_default=True, help="Episodes, played together.")
 @click.option(
     "--checkpoint",
@@ -46,10 +45,6 @@ def main(
     The actions are the policy's mode, the episodes none that training or its evaluations had. The result is printed
     and written to evaluation.json in DIRECTORY. The replay buffer is not read.
     """
-    if not os.path.exists(run_directory.RunDirectory(logdir).marker):  # False for what can be no path, too
-        raise click.UsageError(
-            f"expected the --logdir of a run, got {logdir}: there is no {run_directory.MARKER} in it"
-        )
     quiet()
     from ne_dreamer_jax.runs import checkpoint, evaluation
     from ne_dreamer_jax.system import compile_cache

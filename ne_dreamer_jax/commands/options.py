@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 from ne_dreamer_jax import envs, settings
+from ne_dreamer_jax.runs import run_directory
 
 
 class Name(click.ParamType):
@@ -68,6 +69,18 @@ class UserPath(click.Path):
         if not text or text != text.strip() or any(ord(letter) < 32 for letter in text):
             self.fail(f"expected a path without line breaks, and without blanks at its ends, got {text!r}", param, ctx)
         return super().convert(text, param, ctx)
+
+
+class Run(UserPath):
+    """The directory of a run that was trained."""
+
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path, if a run lies there."""
+        path = super().convert(value, param, ctx)
+        if not os.path.exists(run_directory.RunDirectory(path).marker):  # False for what can be no path, too
+            marker = run_directory.MARKER
+            self.fail(f"expected the --logdir of a run, got {path}: there is no {marker} in it", param, ctx)
+        return path
 
 
 def say(line: str) -> None:

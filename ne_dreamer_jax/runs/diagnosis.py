@@ -14,7 +14,6 @@ they are low or below zero whatever the latent holds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,16 +21,13 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.vector import as_vector
 from ne_dreamer_jax.loop.play import Steps, make_play
-from ne_dreamer_jax.losses import image_loss
-from ne_dreamer_jax.nets.decoder import Decoder
 from ne_dreamer_jax.nets.rssm import feature
-from ne_dreamer_jax.runs import evaluation, pictures, plots, run_directory
+from ne_dreamer_jax.runs import decoding, evaluation, pictures, plots, run_directory
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.types import Array, ContinuousAction, Latent
 
@@ -41,7 +37,6 @@ SATURATED = 0.95
 """Beyond this a component of the policy's mode counts as at the end of tanh, whose slope is below a tenth there."""
 STARTS = 512
 """Open loops, at most."""
-DECODED_BATCH, DECODER_RATE = 64, 1e-3
 COLUMNS = 10  # of a picture
 
 
@@ -77,7 +72,7 @@ def diagnose(
     agent, params = loaded.agent, loaded.state.params
     if agent.inspection is None:
         raise ValueError(f"{run}: expected a run of an agent with a world model, got {agent.config.method}")
-    play_key, loop_key, decoder_key = jax.random.split(jax.random.key(seed), 3)
+    play_key, loop_key, decoder_key, draw_key = jax.random.split(jax.random.key(seed), 4)
     loaded = evaluation.in_env(loaded, env_configs.with_all(loaded.config.env))
     steps, returns = _play(loaded, play_key, episodes)
     told: dict[str, Any] = {"updates": int(loaded.state.update), "episodes": episodes}
@@ -106,8 +101,13 @@ def diagnose(
         told["saturated"] = saturated(held_out)
         echo(f"Policy: at an end of tanh in a share of steps, by component: {_round(told['saturated'])}")
     files = RunDirectory(Path(run))
-    if decoder_updates and images(steps.obs):
-        told["decoded"] = _decoded(loaded, loop_key, decoder_key, fit, held_out, horizon, decoder_updates, files, echo)
+    if decoder_updates and images(held_out.obs):
+        name = images(held_out.obs)[0]
+        decoded = decoding.post_hoc_decoder(agent, decoder_key, fit, held_out, name, decoder_updates)
+        told["decoded"] = decoded.explained
+        echo(f"Decoded from frozen latents: {decoded.explained:.2f} of the variance of unseen frames' pixels")
+        strips = filmstrips(agent, params, draw_key, held_out, name, decoded.draw, horizon)
+        pictures.attempt(lambda: plots.filmstrips(*strips, files.decoded), files.decoded, echo)
     run_directory.write_diagnosis(files, told)
     return told
 
@@ -248,88 +248,36 @@ def saturated(steps: Steps) -> list[float]:
     return [float(x) for x in (action > SATURATED).mean(0)]
 
 
-class Decoded(NamedTuple):
-    """A decoder made after training, and how well it draws frames that it has not seen."""
-
-    draw: Callable[[Latent], np.ndarray]  # latents [N, ...] to uint8 [N, H, W, C]
-    explained: float  # share of the variance of the pixels, beside the mean frame
-
-
-def post_hoc_decoder(
-    agent: Agent, key: Array, fit: Steps, held_out: Steps, name: str, updates: int, batch: int = DECODED_BATCH
-) -> Decoded:
-    """Trains DreamerV3's decoder, mirroring the agent's encoder, on frozen latents and the image called ``name``."""
-    frames, latents = fit.obs[name][fit.counts], jax.tree.map(lambda x: x[fit.counts], fit.latent)
-    spec = {name: jax.eval_shape(lambda: jnp.asarray(frames[0]))}
-    config = agent.config.encoder
-    blocks = math.gcd(math.gcd(8, latents.deter.shape[-1]), config.depth * config.multipliers[-1])
-    decoder = Decoder(config, spec, blocks)
-    optimizer = optax.flatten(optax.adam(DECODER_RATE))
-    init_key, key = jax.random.split(key)
-    params = decoder.init(init_key, jax.tree.map(lambda x: x[:1], latents))
-    decode: Any = lambda params, latent: decoder.apply(params, latent)
-
-    @jax.jit
-    def update(params: Any, state: Any, latent: Latent, image: Array) -> tuple[Any, Any]:
-        loss = lambda params: jnp.mean(image_loss(decode(params, latent)[name], image))
-        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to int32 powers
-            change, state = optimizer.update(jax.grad(loss)(params), state, params)
-        return optax.apply_updates(params, change), state
-
-    state = optimizer.init(params)
-    rows = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    for _ in range(updates):
-        chosen = rows.integers(len(frames), size=batch)
-        params, state = update(params, state, jax.tree.map(lambda x, i=chosen: x[i], latents), frames[chosen])
-    drawn = jax.jit(lambda latent: decode(params, latent)[name])
-    draw = lambda latent: np.asarray(jnp.round(255 * drawn(latent)).astype(jnp.uint8))
-
-    mean, error, variance = frames.mean(0) / 255, 0.0, 0.0
-    seen, unseen = held_out.obs[name][held_out.counts], jax.tree.map(lambda x: x[held_out.counts], held_out.latent)
-    for i in range(0, len(seen), batch):
-        image = seen[i : i + batch] / 255
-        predicted = np.asarray(drawn(jax.tree.map(lambda x, i=i: x[i : i + batch], unseen)))
-        error, variance = error + np.square(image - predicted).sum(), variance + np.square(image - mean).sum()
-    return Decoded(draw, float(1 - error / max(variance, 1e-12)))
-
-
-def _decoded(
-    loaded: evaluation.Loaded,
-    loop_key: Array,
+def filmstrips(
+    agent: Agent,
+    params: Any,
     key: Array,
-    fit: Steps,
-    held_out: Steps,
+    steps: Steps,
+    name: str,
+    draw: Callable[[Latent], np.ndarray],
     horizon: int,
-    updates: int,
-    files: RunDirectory,
-    echo: Callable[[str], None],
-) -> float:
-    """Makes the decoder, draws `decoded.png`, and says how well it draws."""
-    name = images(held_out.obs)[0]
-    decoded = post_hoc_decoder(loaded.agent, key, fit, held_out, name, updates)
-    echo(f"Decoded from frozen latents: {decoded.explained:.2f} of the variance of unseen frames' pixels")
-    one = jax.tree.map(lambda x: x[:, 0], held_out)
+) -> tuple[dict[str, np.ndarray], list[list[str]]]:
+    """Rows and columns of `plots.filmstrips`: the first episode as it was seen and decoded, then an open loop of it.
+
+    ``name`` is the image's, ``draw`` decodes latents [n, ...].
+    """
+    one = jax.tree.map(lambda x: x[:, 0], steps)
     length = int(one.counts.sum())
     some = np.linspace(0, length - 1, min(COLUMNS, length)).round().astype(int)
     at = lambda latent, rows: jax.tree.map(lambda x: x[rows], latent)
-    rows = {"seen": one.obs[name][some], "decoded": decoded.draw(at(one.latent, some))}
+    rows = {"seen": one.obs[name][some], "decoded": draw(at(one.latent, some))}
     columns = [[f"step {t}" for t in some]] * 2
     if length > horizon:
         first = (length - horizon) // 2
         ahead = np.linspace(0, horizon, min(COLUMNS, horizon + 1)).round().astype(int)
-        latents = loaded.agent.open_loop(
-            loaded.state.params,
-            loop_key,
-            jax.tree.map(lambda x: jnp.asarray(x[first : first + 1]), one.latent),
-            jnp.asarray(one.action[first : first + horizon, None]),
-        )
+        start = jax.tree.map(lambda x: jnp.asarray(x[first : first + 1]), one.latent)
+        latents = agent.open_loop(params, key, start, jnp.asarray(one.action[first : first + horizon, None]))
         path = jax.tree.map(
             lambda before, after: np.concatenate([before[first][None], after[:, 0]]), one.latent, latents
         )
-        rows |= {"seen ": one.obs[name][first + ahead], "predicted": decoded.draw(at(path, ahead))}
+        rows |= {"seen ": one.obs[name][first + ahead], "predicted": draw(at(path, ahead))}
         columns += [[f"{first} + {h}" for h in ahead]] * 2
-    pictures.attempt(lambda: plots.filmstrips(rows, columns, files.decoded), files.decoded, echo)
-    return decoded.explained
+    return rows, columns
 
 
 def shares(known: Mapping[str, float], most: int = 12) -> str:

@@ -13,7 +13,7 @@ from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.drqv2 import DrQv2Config
 from ne_dreamer_jax.envs.config import DmcConfig, RoomsConfig, with_all
 from ne_dreamer_jax.loop.play import Steps
-from ne_dreamer_jax.runs import diagnosis
+from ne_dreamer_jax.runs import decoding, diagnosis
 from ne_dreamer_jax.types import ContinuousAction, EnvSpec, Latent
 from tests import tiny
 from tests.experiments import toy
@@ -106,7 +106,7 @@ def test_the_decoder_draws_what_the_latents_hold_and_no_more():
     steps = jax.tree.map(lambda x: x[:64], steps._replace(obs=obs, latent=latent))
     fit, held_out = diagnosis.halves(steps)
     share = {
-        name: diagnosis.post_hoc_decoder(agent, jax.random.key(0), fit, held_out, name, updates=800, batch=16).explained
+        name: decoding.post_hoc_decoder(agent, jax.random.key(0), fit, held_out, name, updates=800, batch=16).explained
         for name in obs
     }
     assert share["held"] > 0.5
