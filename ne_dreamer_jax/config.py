@@ -104,10 +104,10 @@ def laptop(size: str) -> Config:
     Half the recurrent state; frames of 32 x 32, encoded in patches of 4 x 4 and by one convolution; a small predictor.
     Behaviour is learned from the last four steps of each sequence alone, and the actor is trained by gradients through
     the world model (tried with continuous actions only), its means drawn away from the ends of their tanh, where it
-    would stop learning. The learning rate is 25 times the paper's, and returns are divided by as little as 0.1, not 1:
-    first rewards are often hundredths, and would teach the actor nothing beside its entropy, which weighs ten times the
-    paper's. experiments/RESULTS.md says what this reaches, what the penalty on the means is worth, and what else was
-    tried.
+    would stop learning. The slow critic follows five times as fast as the paper's, so that values keep up with so few
+    updates. The learning rate is 25 times the paper's, and returns are divided by as little as 0.1, not 1: first
+    rewards are often hundredths, and would teach the actor nothing beside its entropy, which weighs ten times the
+    paper's. experiments/RESULTS.md says what this reaches, what each of these is worth, and what else was tried.
     """
     small = _small_agent(size, predictor_width=64)
     agent = replace(
@@ -120,6 +120,7 @@ def laptop(size: str) -> Config:
             entropy=3e-3,
             mean_penalty=3e-3,
             gradient="dynamics",
+            slow_rate=0.1,
             return_floor=0.1,
         ),
         optimizer=OptimizerConfig(learning_rate=1e-3, warmup=100),
