@@ -34,9 +34,22 @@ from ne_dreamer_jax.system.quiet import quiet
     show_default=True,
     help="The checkpoint with the best evaluation return during training, or the last one.",
 )
+@click.option(
+    "--actions",
+    type=click.Choice(["mode", "sample"]),
+    default="mode",
+    show_default=True,
+    help="The policy's mode, or samples, with which more varies where the task is solved.",
+)
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 def main(
-    logdir: Path, episodes: int, horizon: int, decoder_updates: int, prefer: Literal["best", "newest"], seed: int
+    logdir: Path,
+    episodes: int,
+    horizon: int,
+    decoder_updates: int,
+    prefer: Literal["best", "newest"],
+    actions: Literal["mode", "sample"],
+    seed: int,
 ) -> None:
     """Play episodes with the policy of a run, and say what its agent knows of them.
 
@@ -58,6 +71,7 @@ def main(
             horizon=horizon,
             decoder_updates=decoder_updates,
             prefer=prefer,
+            actions=actions,
             seed=seed,
             echo=say,
         )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.agents.base import Agent, Mode
 from ne_dreamer_jax.envs.vector import VectorEnv
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, ContinuousAction, Latent, PolicyState, images_of
@@ -53,7 +53,7 @@ class Playing(NamedTuple):
 
 
 class Play(Protocol):
-    """Plays episodes with an agent's mode, or with uniformly random actions."""
+    """Plays episodes with an agent's actions, or with uniformly random ones."""
 
     def __call__(
         self, params: Any, key: Array, episodes: int, random: bool = False, frames: bool = False, steps: bool = False
@@ -65,16 +65,17 @@ class Play(Protocol):
         ...
 
 
-def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = STEPS) -> Play:
+def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = STEPS, mode: Mode = "mode") -> Play:
     """A function that plays episodes in these environments with this agent.
 
     Args:
       env: observes at least what the agent does; what it does not see is for `Steps` and the frames alone.
       max_steps: agent steps after which an episode that has not ended is left; `Evaluation.unfinished` counts those.
       chunk_steps: vector steps of one call to the device.
+      mode: which actions the agent takes, its policy's mode or samples.
     """
     run = jax.jit(
-        in_32_bits(partial(_run, env, agent, chunk_steps)), static_argnames=("frames", "steps"), donate_argnums=1
+        in_32_bits(partial(_run, env, agent, chunk_steps, mode)), static_argnames=("frames", "steps"), donate_argnums=1
     )
 
     @in_32_bits
@@ -131,6 +132,7 @@ def _run(
     env: VectorEnv,
     agent: Agent,
     length: int,
+    mode: Mode,
     params: Any,
     carry: Playing,
     random: Array,
@@ -143,7 +145,7 @@ def _run(
         key, act_key, random_key = jax.random.split(carry.key, 3)
         env_state, shown = env.step(carry.env, carry.policy.prev_action)
         timestep = shown._replace(obs={name: shown.obs[name] for name in agent.spec.observation})
-        policy, action = agent.act(params, carry.policy, timestep, act_key, mode="mode")
+        policy, action = agent.act(params, carry.policy, timestep, act_key, mode=mode)
         action = jnp.where(random, random_action(agent.spec.action, random_key, action.shape[0]), action)
         policy = policy._replace(prev_action=action)
         counts, cuts = ~carry.done, env.cuts(env_state)

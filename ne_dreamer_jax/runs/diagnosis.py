@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.agents.base import Agent
+from ne_dreamer_jax.agents.base import Agent, Mode
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.vector import as_vector
 from ne_dreamer_jax.loop.play import Steps, make_play
@@ -48,6 +48,7 @@ def diagnose(
     horizon: int = 15,
     decoder_updates: int = 1_000,
     prefer: Literal["best", "newest"] = "newest",
+    actions: Mode = "mode",
     seed: int = 0,
     echo: Callable[[str], None] = print,
 ) -> dict[str, Any]:
@@ -60,6 +61,7 @@ def diagnose(
       horizon: steps H of an open loop.
       decoder_updates: of the decoder, 64 frames each; 0 for none.
       prefer: the newest checkpoint, or that with the best evaluation.
+      actions: the policy's mode, or samples, with which more varies where the task is solved.
       seed: of the episodes, the open loops and the decoder.
 
     Raises:
@@ -74,8 +76,8 @@ def diagnose(
         raise ValueError(f"{run}: expected a run of an agent with a world model, got {agent.config.method}")
     play_key, loop_key, decoder_key, draw_key = jax.random.split(jax.random.key(seed), 4)
     loaded = evaluation.in_env(loaded, env_configs.with_all(loaded.config.env))
-    steps, returns = _play(loaded, play_key, episodes)
-    told: dict[str, Any] = {"updates": int(loaded.state.update), "episodes": episodes}
+    steps, returns = _play(loaded, play_key, episodes, actions)
+    told: dict[str, Any] = {"updates": int(loaded.state.update), "episodes": episodes, "actions": actions}
     told["return"] = float(np.mean(returns))
     echo(f"{episodes} episodes after {told['updates']:,} updates: return {told['return']:.1f}")
 
@@ -98,7 +100,7 @@ def diagnose(
         )
     )
     if isinstance(agent.spec.action, ContinuousAction):
-        told["saturated"] = saturated(held_out)
+        told["saturated"] = saturated(np.asarray(agent.heads(params, features(held_out)).action))
         echo(f"Policy: at an end of tanh in a share of steps, by component: {_round(told['saturated'])}")
     files = RunDirectory(Path(run))
     if decoder_updates and images(held_out.obs):
@@ -112,10 +114,10 @@ def diagnose(
     return told
 
 
-def _play(loaded: evaluation.Loaded, key: Array, episodes: int) -> tuple[Steps, np.ndarray]:
+def _play(loaded: evaluation.Loaded, key: Array, episodes: int, actions: Mode) -> tuple[Steps, np.ndarray]:
     env = as_vector(loaded.env)
     try:
-        play = make_play(env, loaded.agent, loaded.config.loop.eval_max_steps)
+        play = make_play(env, loaded.agent, loaded.config.loop.eval_max_steps, mode=actions)
         played = play(loaded.state.params, key, episodes, steps=True)
     finally:
         if env.host is not None:
@@ -242,10 +244,9 @@ def returns_that_came(steps: Steps, value: np.ndarray, discount: float) -> np.nd
     return came
 
 
-def saturated(steps: Steps) -> list[float]:
-    """The share of steps in which each component of the policy's mode is beyond `SATURATED`."""
-    action = np.abs(steps.action[steps.counts])
-    return [float(x) for x in (action > SATURATED).mean(0)]
+def saturated(mode: np.ndarray) -> list[float]:
+    """The share of states in which each component of the policy's mode [N, A] is beyond `SATURATED`."""
+    return [float(x) for x in (np.abs(mode) > SATURATED).mean(0)]
 
 
 def filmstrips(

@@ -73,10 +73,8 @@ def test_open_loops_start_where_the_same_episode_goes_on():
     assert not len(diagnosis.starts(jax.random.key(0), steps, 30)[0])
 
 
-def test_saturated_components_are_counted_in_the_episodes_alone():
-    action = np.zeros((6, 2, 2))
-    action[:, :, 0], action[:2, 0, 1], action[4:] = -1.0, 0.99, 1.0  # what follows the episodes does not count
-    assert diagnosis.saturated(episodes([4, 4], action=action)) == [1.0, 0.25]
+def test_saturated_components_are_counted():
+    assert diagnosis.saturated(np.array([[-1.0, 0.5], [-0.99, 0.0], [0.96, -0.9], [1.0, 1.0]])) == [1.0, 0.25]
 
 
 def test_components_are_named():
@@ -145,6 +143,19 @@ def test_a_run_is_diagnosed_and_the_result_kept(run):
         "Critic:",
         "Policy:",
     ]
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_sampled_actions_are_not_the_mode_and_saturation_is_that_of_the_mode(run):
+    """The policy of a run this short is all noise: its samples reach the ends, its mode does not."""
+    quiet = lambda line: None
+    told = {
+        actions: nedreamer.diagnose(run, toy.env(), episodes=4, horizon=3, actions=actions, echo=quiet)
+        for actions in ("mode", "sample")
+    }
+    assert told["sample"]["actions"] == "sample"
+    assert told["sample"]["return"] != told["mode"]["return"]
+    assert told["sample"]["saturated"] == told["mode"]["saturated"] == [0.0]
 
 
 def test_the_command_refuses_what_is_no_run(tmp_path):
