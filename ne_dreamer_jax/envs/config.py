@@ -168,7 +168,7 @@ def with_images(config: Any) -> Any:
 
 
 def with_all(config: Any) -> Any:
-    """The settings of the same environment with images and vectors, where they have both; else ``config`` itself."""
+    """The settings of the same task of DeepMind Control with images and vectors; of others, ``config`` itself."""
     return replace(with_images(config), obs="both") if isinstance(config, _SAME_CONTROL) else config
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -100,20 +101,30 @@ def evaluate(
     loaded = load(run, env, prefer)
     if with_video and env is None:
         loaded = in_env(loaded, env_configs.with_images(loaded.config.env))  # the agent does not see them
-    venv, other = as_vector(loaded.env), None
+    with opened(loaded.env) as venv:
+        if also is None:
+            return _evaluate(Path(run), loaded, venv, None, None, episodes, seed, with_video, echo)
+        with opened(_other(also, loaded)) as other:
+            return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+
+
+@contextlib.contextmanager
+def opened(env: Any) -> Iterator[VectorEnv]:
+    """Environments at once of ``env``, closed at the end of the block.
+
+    Raises:
+      ValueError: they are in worker processes that fail within the block.
+    """
+    venv = as_vector(env)
     try:
-        other = None if also is None else _other(also, loaded)
-        return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+        yield venv
     except jax.errors.JaxRuntimeError as error:
-        hosts = [used.host for used in (venv, other) if used is not None and used.host is not None]
-        failures = [host.failure for host in hosts if host.failure is not None]
-        if not failures:
+        if venv.host is None or venv.host.failure is None:
             raise
-        raise ValueError(f"the environments failed: {failures[0]}") from error
+        raise ValueError(f"the environments failed: {venv.host.failure}") from error
     finally:
-        for used in (venv, other):
-            if used is not None and used.host is not None:
-                used.host.close()
+        if venv.host is not None:
+            venv.host.close()
 
 
 def _evaluate(

@@ -18,6 +18,7 @@ from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.config import GIVEN
 from ne_dreamer_jax.runs import checkpoint, run_directory
 from ne_dreamer_jax.runs.run_directory import RefusedError, RunDirectory, typed
+from ne_dreamer_jax.settings import as_text
 from ne_dreamer_jax.types import EnvSpec
 
 
@@ -50,7 +51,8 @@ def check_agent(parent: Path, path: Path, config: Config, spec: EnvSpec, like: A
       like: the new run's train state, as arrays or `jax.ShapeDtypeStruct`.
 
     Raises:
-      ValueError: the parent's agent has other arrays, or its environment other observations or actions.
+      ValueError: the parent's agent has other arrays, or a continuation head that learned something else, or its
+        environment other observations or actions.
       RefusedError: it has no checkpoint.
     """
     if _has_begun(path):
@@ -64,6 +66,13 @@ def check_agent(parent: Path, path: Path, config: Config, spec: EnvSpec, like: A
                 f"--fork {typed(parent)}: expected an environment with the same observations and actions, got\n"
                 f"  {stored.env.task}: {theirs}\n  {config.env.task}: {spec}"
             )
+    setting = "discount_in_head"
+    head, wanted = (getattr(getattr(each.agent, "behavior", None), setting, None) for each in (stored, config))
+    if None not in (head, wanted) and head != wanted:
+        raise ValueError(
+            f"--fork {typed(parent)}: expected agent.behavior.{setting} as its continuation head was trained, "
+            f"{as_text(head)}, got {as_text(wanted)}; add --set agent.behavior.{setting}={as_text(head)}"
+        )
     try:
         checkpoint.check_fit(_newest(parent), "agent", like)
     except ValueError as error:

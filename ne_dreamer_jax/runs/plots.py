@@ -156,25 +156,27 @@ def _picture(path: Path, width: float, height: float) -> Iterator[Axes]:
         save(empty, path)
 
 
-def filmstrips(rows: Mapping[str, np.ndarray], columns: Sequence[Sequence[str]], path: Path) -> None:
-    """Draws frames in rows into a PNG.
+class Filmstrip(NamedTuple):
+    """A row of frames."""
 
-    Args:
-      rows: name -> uint8 ``[n, H, W, C]``, with one or three channels.
-      columns: of each row, what is written above each of its frames.
-      path: of the PNG, replaced whole.
-    """
-    most = max(len(frames) for frames in rows.values())
-    with figure(1.1 * most + 0.6, 1.35 * len(rows), dpi=150) as empty:
-        grid = empty.subplots(len(rows), most, squeeze=False)
-        for axes, titles, (name, frames) in zip(grid, columns, rows.items(), strict=True):
+    name: str
+    frames: np.ndarray  # uint8 [n, H, W, C], with one or three channels
+    titles: Sequence[str]  # above each frame
+
+
+def filmstrips(strips: Sequence[Filmstrip], path: Path) -> None:
+    """Draws rows of frames into a PNG, which is replaced whole."""
+    most = max(len(strip.frames) for strip in strips)
+    with figure(1.1 * most + 0.6, 1.35 * len(strips), dpi=150) as empty:
+        grid = empty.subplots(len(strips), most, squeeze=False)
+        for axes, strip in zip(grid, strips, strict=True):
             for i, each in enumerate(axes):
                 each.set(xticks=[], yticks=[])
                 each.spines[:].set_visible(False)
-                if i < len(frames):
-                    each.imshow(frames[i].squeeze(), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-                    each.set_title(titles[i], fontsize=7)
-            axes[0].set_ylabel(name.strip(), fontsize=8)
+                if i < len(strip.frames):
+                    each.imshow(strip.frames[i].squeeze(), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+                    each.set_title(strip.titles[i], fontsize=7)
+            axes[0].set_ylabel(strip.name, fontsize=8)
         save(empty, path)
 
 

@@ -67,3 +67,8 @@ def env(image: bool = False) -> base.Env:
     return base.from_core(
         base.Core(spec, reset, base.restart_or_step(reset, step), lambda state: {"position": state[0][None]} | blank)
     )
+
+
+def seen() -> base.Env:
+    """The same with an image, to be named as ``tests.experiments.toy:seen``."""
+    return env(image=True)

@@ -122,6 +122,19 @@ def test_an_agent_of_other_shapes_or_another_action_is_refused_with_what_differs
         fork.check_agent(mine, tmp_path / "new", run.config, spec, run.shapes.train)
 
 
+def test_a_head_that_learned_something_else_is_refused_with_what_to_set(parent, tmp_path):
+    """A parent whose head holds the discount, as in a config.json older than the setting, would be discounted twice."""
+    mine = shutil.copytree(parent, tmp_path / "older")
+    config = toy.config(eval_every=None)
+    inside = configs.override(config, "agent.behavior.discount_in_head=true")
+    run_directory.store_config(RunDirectory(mine), inside)
+    run = stub.build(config, image=False)
+    check = lambda config: fork.check_agent(mine, tmp_path / "new", config, run.agent.spec, run.shapes.train)
+    with pytest.raises(ValueError, match=r"got false; add --set agent\.behavior\.discount_in_head=true"):
+        check(config)
+    check(inside)
+
+
 def test_the_command_refuses_a_parent_that_is_none(tmp_path):
     code, output = invoke(command, "--preset", "smoke", "--fork", tmp_path, "--logdir", tmp_path / "run")
     assert (code, "expected a run directory" in output) == (2, True)

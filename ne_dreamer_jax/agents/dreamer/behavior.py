@@ -31,7 +31,7 @@ from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.nets.rssm import RSSM, feature
 from ne_dreamer_jax.settings import BEFORE, ranges
 from ne_dreamer_jax.settings.ranges import LARGEST, Count, NonNegative, Positive, Range, Share, ShareBelowOne
-from ne_dreamer_jax.types import Array, Latent, Metrics, Params, ReturnScale, Rollout
+from ne_dreamer_jax.types import Array, ContinuousAction, Latent, Metrics, Params, ReturnScale, Rollout
 
 LOSSES = ("actor", "critic", "replay_critic")
 
@@ -65,7 +65,7 @@ class BehaviorConfig:
     mean_penalty: NonNegative = 0.0
     """Weight of the squares of the policy's means before their tanh, summed over a continuous action's components. It
     keeps a policy from the ends of tanh, where next to no gradient reaches the actor (rlkit's soft actor-critic has it,
-    at 1e-3). 0 as in the paper and DreamerV3; discrete policies have no such means."""
+    averaged over the components, at 1e-3). 0 as in the paper and DreamerV3; discrete policies have no such means."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
     """How the actor is trained: by the score function, or through the world model."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
@@ -265,8 +265,9 @@ def actor_critic_losses(
         "imagined/value": jnp.mean(value),
         "imagined/return_scale": divisor,
         "policy/entropy": jnp.mean(entropy),
-        "policy/squared_means": jnp.mean(squares),
     }
+    if isinstance(nets.spec.action, ContinuousAction):
+        metrics["policy/squared_means"] = jnp.mean(squares)
     if config.entropy_final is not None:
         metrics["policy/entropy_scale"] = eta
     return losses, scale, jax.lax.stop_gradient(metrics)
