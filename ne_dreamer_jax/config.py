@@ -177,7 +177,7 @@ def released_code(size: str) -> Config:
         base,
         heads=replace(base.heads, clip_actions=False),
         world_model=WorldModelConfig(kl_unimix=0.0),
-        behavior=BehaviorConfig(discount=1 - 1 / 333, percentile_method="nearest"),
+        behavior=BehaviorConfig(discount=1 - 1 / 333, discount_in_head=False, percentile_method="nearest"),
         objective=NextEmbedding(
             PredictorConfig(discrete_action="normalised", attention_init="xavier"),
             sample_deviation=True,

@@ -202,6 +202,7 @@ def test_the_released_code_differs_where_fidelity_says_so():
         "loop.prefill": 1_056,
         "agent.behavior.discount": 1 - 1 / 333,
     }
+    assert code["agent.behavior.discount_in_head"] is False, "whatever the default is"
     fidelity = (Path(__file__).parents[1] / "experiments" / "FIDELITY.md").read_text()
     for path in code:
         if paper[path] != code[path]:
