@@ -5,7 +5,8 @@ Four questions about the states that its own policy visits, each answered on epi
 - Is what matters in the latent? Linear probes read off the features what the environment knows of itself as vectors;
   and a decoder, made after training and on frozen latents, draws the images (NE-Dreamer, "Representation diagnostics").
 - Does the model know what follows? The same probes on latents of an open loop under the actions that were taken.
-- Does the critic know what states are worth? Its values beside the discounted returns that came.
+- Does the critic know what states are worth? Its values beside the discounted returns that came, and beside those of
+  long imagined trajectories, which tell the critic's errors from the model's.
 - Can the policy still learn? Where its mean is at an end of tanh, next to no gradient reaches the actor.
 
 Shares are of the variance in the episodes that are told about: where little varies, as in a body that stands still,
@@ -81,7 +82,7 @@ def diagnose(
     if agent.inspection is None:
         raise ValueError(f"{run}: expected a run of an agent with a world model, got {agent.config.method}")
     key = jax.random.fold_in(jax.random.key(seed), DIAGNOSIS)
-    play_key, loop_key, decoder_key, draw_key = jax.random.split(key, 4)
+    play_key, loop_key, critic_key, decoder_key, draw_key = jax.random.split(key, 5)
     told = evaluation.head(loaded, episodes, seed, echo)
     told |= {"updates": int(loaded.state.update), "actions": actions}
     loaded = evaluation.in_env(loaded, env_configs.with_all(loaded.config.env))
@@ -89,7 +90,7 @@ def diagnose(
 
     fit, held_out = probing.halves(steps)
     told |= _models(agent, params, loop_key, fit, held_out, spec, horizon, echo)
-    told["critic"] = judged = probing.critic(agent, params, held_out)
+    told["critic"] = judged = probing.critic(agent, params, critic_key, held_out)
     echo(_critic_line(judged))
     if isinstance(agent.spec.action, ContinuousAction):
         mode = np.asarray(agent.heads(params, jnp.asarray(probing.features(held_out))).action)
@@ -155,8 +156,8 @@ def _critic_line(judged: Mapping[str, float]) -> str:
     if not judged["states"]:
         return "Critic: nothing to tell, as all returns hang on its own value where the time limit ended the episodes"
     return (
-        f"Critic: mean value {judged['value']:.3g}, mean return that came {judged['return']:.3g}, correlation "
-        f"{judged['correlation']:.2f} ({judged['states']:,} states)"
+        f"Critic: mean value {judged['value']:.3g}, imagined return {judged['imagined']:.3g}, return that came "
+        f"{judged['return']:.3g}, correlation with it {judged['correlation']:.2f} ({judged['states']:,} states)"
     )
 
 

@@ -5,6 +5,7 @@ Steps are ``[steps, M, ...]``: an action is taken from the observation of its st
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,8 +15,9 @@ import numpy as np
 
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.loop.play import Steps
+from ne_dreamer_jax.losses import lambda_returns
 from ne_dreamer_jax.nets.rssm import feature
-from ne_dreamer_jax.types import Array
+from ne_dreamer_jax.types import Array, Latent
 
 RIDGE = 0.01
 """Of a probe, in shares of a standardised feature's sum of squares."""
@@ -23,6 +25,8 @@ SATURATED = 0.95
 """Beyond this a component of the policy's mode counts as at the end of tanh, whose slope is below a tenth there."""
 STARTS = 512
 """Open loops, at most."""
+IMAGINED = 256
+"""States from which returns are imagined, at most."""
 BOOTSTRAPPED = 0.3
 """A return counts as one that came where the critic's own value, at a time limit, has at most this weight in it."""
 
@@ -136,23 +140,46 @@ def starts(key: Array, steps: Steps, horizon: int) -> tuple[np.ndarray, np.ndarr
     return t[chosen], m[chosen]
 
 
-def critic(agent: Agent, params: Any, steps: Steps) -> dict[str, float]:
-    """The critic's values beside the discounted returns that came: means, and their correlation.
+def critic(agent: Agent, params: Any, key: Array, steps: Steps) -> dict[str, float]:
+    """The critic's values beside the discounted returns that came, and beside those that the model expects: means.
 
-    Over the states far enough from a time limit that what came does not hang on the critic's value there
-    (`BOOTSTRAPPED`): ``states`` says how many, and where there is none, no more is told. The critic is that of the
-    policy's samples.
+    Where the ``value`` is near what is ``imagined`` and above the ``return`` that came, it is the model that promises
+    too much. ``correlation`` is that of values and returns.
+
+    All are of the states far enough from a time limit that what came does not hang on the critic's value there
+    (`BOOTSTRAPPED`), ``imagined`` of `IMAGINED` of them: ``states`` says how many there are, and where there is none,
+    no more is told. Critic and imagination are of the policy's samples.
     """
     value = np.asarray(agent.heads(params, feature(steps.latent)).value)
-    came, bootstrapped = returns_that_came(steps, value, agent.config.behavior.discount)
+    discount = agent.config.behavior.discount
+    came, bootstrapped = returns_that_came(steps, value, discount)
     here = steps.counts & ~last_steps(steps) & (bootstrapped <= BOOTSTRAPPED)
-    value, came = value[here], came[here]
-    if not len(value):
+    t, m = np.nonzero(here)
+    if not len(t):
         return {"states": 0}
+    value, came = value[t, m], came[t, m]
     varies = min(value.std(), came.std()) > 0
-    correlation = float(np.corrcoef(value, came)[0, 1]) if varies else 0.0
-    means = {"value": float(value.mean()), "return": float(came.mean())}
-    return {"states": len(value), **means, "correlation": correlation}
+    choice_key, key = jax.random.split(key)
+    chosen = np.asarray(jax.random.permutation(choice_key, len(t)))[:IMAGINED]
+    latent = jax.tree.map(lambda x: jnp.asarray(x[t[chosen], m[chosen]]), steps.latent)
+    return {
+        "states": len(t),
+        "value": float(value.mean()),
+        "imagined": float(imagined_returns(agent, params, key, latent, discount).mean()),
+        "return": float(came.mean()),
+        "correlation": float(np.corrcoef(value, came)[0, 1]) if varies else 0.0,
+    }
+
+
+def imagined_returns(agent: Agent, params: Any, key: Array, latent: Latent, discount: float) -> np.ndarray:
+    """Discounted sums [M] of the rewards that the model expects under the policy from latents [M, ...].
+
+    They are imagined for so long that the critic's value at the end counts for `BOOTSTRAPPED` at most.
+    """
+    horizon = max(1, math.ceil(math.log(BOOTSTRAPPED) / math.log(discount))) if discount > 0 else 1
+    heads = agent.imagine(params, key, latent, horizon).heads
+    along = lambda x: jnp.asarray(x).T  # [M, H + 1]
+    return np.asarray(lambda_returns(along(heads.reward), along(heads.value), along(heads.discount), 1.0))[:, 0]
 
 
 def last_steps(steps: Steps) -> np.ndarray:

@@ -89,21 +89,35 @@ def test_returns_that_came_are_discounted_sums_to_the_episodes_end():
             np.testing.assert_allclose(weight[t, m], 0.9 ** (length - 1 - t) * goes_on, rtol=1e-6)
 
 
-def judging(value) -> Any:
-    """An agent whose critic says ``value(feature)``."""
+def judging(value, reward: float = 0.0) -> Any:
+    """An agent whose critic says ``value(feature)``, and whose model expects this reward at every step."""
     behavior = SimpleNamespace(discount=0.9)
     heads = lambda params, x: SimpleNamespace(value=value(np.asarray(x)))
-    return SimpleNamespace(heads=heads, config=SimpleNamespace(behavior=behavior))
+
+    def imagine(params, key, latent, horizon) -> Any:
+        numbers = np.full((horizon + 1, len(latent.deter)), 1.0, np.float32)
+        expected = SimpleNamespace(reward=reward * numbers, value=0 * numbers, discount=0.9 * numbers)
+        return SimpleNamespace(heads=expected)
+
+    return SimpleNamespace(heads=heads, imagine=imagine, config=SimpleNamespace(behavior=behavior))
 
 
 def test_the_critic_is_not_judged_by_its_own_values():
-    steps = episodes([60, 40])
-    judged = probing.critic(judging(lambda x: np.full(x.shape[:-1], 1e3)), None, steps)
+    steps, key = episodes([60, 40]), jax.random.key(0)
+    judged = probing.critic(judging(lambda x: np.full(x.shape[:-1], 1e3)), None, key, steps)
     assert judged["value"] == pytest.approx(1e3)
     assert judged["return"] < 0.31e3  # a time limit ends both episodes, with a value of 1,000
     assert judged["states"] == 48 + 28  # 0.9 ** 12 is below 0.3, 0.9 ** 11 is not
-    assert probing.critic(judging(lambda x: x[..., 0]), None, episodes([9, 5])) == {"states": 0}
-    assert probing.critic(judging(lambda x: x[..., 0]), None, episodes([9, 5], terminal=[0]))["states"] == 8
+    first = judging(lambda x: x[..., 0])
+    assert probing.critic(first, None, key, episodes([9, 5])) == {"states": 0}
+    assert probing.critic(first, None, key, episodes([9, 5], terminal=[0]))["states"] == 8
+
+
+def test_what_the_model_expects_is_its_rewards_for_as_long_as_they_count():
+    """1 + 0.9 + 0.9 ** 2 + ..., where what follows the end is worth nothing to the critic."""
+    agent = judging(lambda x: x[..., 0], reward=1.0)
+    judged = probing.critic(agent, None, jax.random.key(0), episodes([60, 40]))
+    assert judged["imagined"] == pytest.approx((1 - 0.9**12) / 0.1, rel=1e-5)
 
 
 def test_open_loops_start_where_the_same_episode_goes_on():
