@@ -107,7 +107,8 @@ def laptop(size: str) -> Config:
     would stop learning. The slow critic follows five times as fast as the paper's, so that values keep up with so few
     updates. The learning rate is 25 times the paper's, and returns are divided by as little as 0.1, not 1: first
     rewards are often hundredths, and would teach the actor nothing beside its entropy, which weighs ten times the
-    paper's. experiments/RESULTS.md says what this reaches, what each of these is worth, and what else was tried.
+    paper's. experiments/RESULTS.md says what this reaches, experiments/TRIALS.md what else was tried, and
+    experiments/FIDELITY.md what the actor's gradient, the penalty and the slow critic's rate are worth.
     """
     small = _small_agent(size, predictor_width=64)
     agent = replace(
@@ -125,12 +126,12 @@ def laptop(size: str) -> Config:
         ),
         optimizer=OptimizerConfig(learning_rate=1e-3, warmup=100),
     )
-    loop = LoopConfig(env_steps=500_000, num_envs=16, replay_ratio=32.0, prefill=2_000, eval_every=20_000)
+    loop = LoopConfig(env_steps=800_000, num_envs=16, replay_ratio=32.0, prefill=2_000, eval_every=20_000)
     return Config(DmcConfig(image_size=32), agent, loop)
 
 
 def quickstart(size: str) -> Config:
-    """Solves a task from pixels in some twenty minutes of a CPU core: `laptop`, with a ball to catch in a cup."""
+    """Solves a task from pixels in ten or twenty minutes of a CPU core: `laptop`, with a ball to catch in a cup."""
     base = laptop(size)
     return replace(
         base, env=replace(base.env, task="dmc/ball_in_cup_catch"), loop=replace(base.loop, env_steps=120_000)
