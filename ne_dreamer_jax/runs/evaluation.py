@@ -101,11 +101,9 @@ def evaluate(
     loaded = load(run, env, prefer)
     if with_video and env is None:
         loaded = in_env(loaded, env_configs.with_images(loaded.config.env))  # the agent does not see them
-    with opened(loaded.env) as venv:
-        if also is None:
-            return _evaluate(Path(run), loaded, venv, None, None, episodes, seed, with_video, echo)
-        with opened(_other(also, loaded)) as other:
-            return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+    with opened(loaded.env) as venv, contextlib.ExitStack() as stack:
+        other = None if also is None else stack.enter_context(opened(_other(also, loaded)))
+        return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
 
 
 @contextlib.contextmanager
