@@ -258,15 +258,17 @@ def with_method(config: Config, method: str, known: Sequence[AnyObjective] = ())
 def override(config: Config, assignment: str) -> Config:
     """`settings.override`, where what hangs together stays together.
 
-    Another objective (``agent.objective=SameStep``) brings the weights of its losses along, and a task of another
-    family (``env.task=...``) that family's settings.
+    Another objective (``agent.objective=SameStep``) brings the weights of its losses along, a task of another family
+    (``env.task=...``) that family's settings, and what says how often DrQ-v2 learns the course of its noise.
     """
     path, _, task = assignment.partition("=")
     if path.strip() == "env.task":
         return replace(config, env=env_configs.for_task(task.strip(), config.env))
     changed = settings.override(config, assignment)
     old, new = config.agent, changed.agent
-    if isinstance(old, DrQv2Config) or isinstance(new, DrQv2Config) or type(old.objective) is type(new.objective):
+    if isinstance(new, DrQv2Config):
+        return replace(changed, agent=_in_time(new, changed.loop)) if path.strip() in DRQV2_CLOCK else changed
+    if isinstance(old, DrQv2Config) or type(old.objective) is type(new.objective):
         return changed
     return _with_objective(config, old, new.objective)
 
@@ -280,7 +282,9 @@ def _with_objective(config: Config, agent: AgentConfig, objective: AnyObjective)
 def _drqv2(config: Config, shared: AgentConfig) -> Config:
     env, loop = config.env, config.loop
     published = drqv2.for_task(env.task) if isinstance(env, DmcConfig) else DrQv2Config()
-    every = budget.steps_per_update(shared.batch_size, shared.batch_length, loop.replay_ratio)
+    every = published.steps_per_update
+    if loop.replay_ratio:
+        every = budget.steps_per_update(shared.batch_size, shared.batch_length, loop.replay_ratio)
     agent = replace(
         published,
         batch_size=min(published.batch_size, shared.batch_size * shared.batch_length),
@@ -291,11 +295,43 @@ def _drqv2(config: Config, shared: AgentConfig) -> Config:
         env = replace(env, image_size=drqv2.IMAGE_SIZE)
     loop = replace(
         loop,
-        replay_ratio=budget.replay_ratio(agent.batch_size, agent.batch_length, every),
+        replay_ratio=loop.replay_ratio and budget.replay_ratio(agent.batch_size, agent.batch_length, every),
         prefill=agent.random_steps,
         write_latents=False,
     )
     return replace(config, env=env, agent=agent, loop=loop)
+
+
+DRQV2_CLOCK = ("loop.replay_ratio", "loop.prefill", "agent.batch_size", "agent.frame_stack", "agent.n_step")
+"""Settings from which it follows when DrQ-v2 learns."""
+
+
+def _in_time(agent: DrQv2Config, loop: LoopConfig) -> DrQv2Config:
+    """With the noise of its updates in step with the loop; a loop that never learns leaves it as it is."""
+    every = agent.steps_per_update
+    if loop.replay_ratio:
+        every = budget.steps_per_update(agent.batch_size, agent.batch_length, loop.replay_ratio)
+    return replace(agent, steps_per_update=every, random_steps=loop.prefill)
+
+
+def check(config: Config) -> None:
+    """Raises ValueError where settings of the agent and of the loop contradict each other."""
+    agent, loop = config.agent, config.loop
+    if not isinstance(agent, DrQv2Config):
+        return
+    expected = _in_time(agent, loop)
+    if abs(expected.steps_per_update / agent.steps_per_update - 1) > 0.01:
+        ratio = budget.replay_ratio(agent.batch_size, agent.batch_length, agent.steps_per_update)
+        raise ValueError(
+            f"agent.steps_per_update: expected {expected.steps_per_update:g}, as loop.replay_ratio "
+            f"{loop.replay_ratio:g} has it for batches of {agent.batch_size} x {agent.batch_length} steps, got "
+            f"{agent.steps_per_update:g}; with loop.replay_ratio={ratio:g} it fits"
+        )
+    if agent.random_steps != loop.prefill:
+        raise ValueError(
+            f"agent.random_steps: expected loop.prefill, {loop.prefill:,}, with which learning begins, got "
+            f"{agent.random_steps:,}; set both"
+        )
 
 
 def _objective(method: str, known: Iterable[AnyObjective]) -> AnyObjective:

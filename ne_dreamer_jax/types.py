@@ -108,7 +108,7 @@ class Transition(NamedTuple):
     """One step of N environments as it goes into replay (see the time convention above)."""
 
     obs: Mapping[str, Array]  # [N, ...]
-    action: Array  # [N, *action.shape], taken from obs; already clipped to the bounds
+    action: Array  # [N, *action.shape], taken from obs; within the bounds, but for ``heads.clip_actions=False``
     reward: Array  # float32 [N]
     is_first: Array  # bool [N]
     is_last: Array  # bool [N]

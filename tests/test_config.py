@@ -139,6 +139,23 @@ def test_drqv2_is_as_published_on_the_papers_budget():
     assert (hard.agent.noise_steps, hard.agent.n_step, hard.loop.replay_ratio) == (500_000, 3, 256 * 6 / 2)
 
 
+def test_drqv2s_noise_keeps_step_with_the_loop():
+    config = configs.with_method(configs.preset("dmc"), "drqv2")
+    for assignment, every in (("agent.batch_size=128", 0.5), ("loop.replay_ratio=512", 1.0), ("agent.n_step=5", 2.0)):
+        config = configs.override(config, assignment)
+        configs.check(config)
+        assert config.agent.steps_per_update == every
+    config = configs.override(config, "loop.prefill=3_000")
+    assert config.agent.random_steps == 3_000
+    with pytest.raises(ValueError, match=r"steps_per_update: expected 2, .* got 4; with loop.replay_ratio=256 it fits"):
+        configs.check(configs.override(config, "agent.steps_per_update=4"))
+    with pytest.raises(ValueError, match=r"random_steps: expected loop.prefill, 3,000"):
+        configs.check(configs.override(config, "agent.random_steps=5"))
+    never = configs.with_method(configs.override(configs.preset("dmc"), "loop.replay_ratio=0"), "drqv2")
+    assert (never.loop.replay_ratio, never.agent.steps_per_update) == (0, 2)
+    configs.check(never)
+
+
 @pytest.mark.parametrize("name", names.PRESETS)
 def test_drqv2_keeps_the_number_of_updates_of_a_preset(name):
     preset = configs.preset(name)

@@ -1,5 +1,7 @@
 """Episodes of other people's in replay, and learning from them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +64,16 @@ def test_an_agent_learns_from_episodes_without_an_environment():
     changed = jax.tree.map(lambda a, b: bool((a != b).any()), before, jax.tree.map(np.asarray, state.params))
     assert all(jax.tree.leaves(changed["actor"]))
     assert np.any(held.data.latent.deter), "latents are written back"
+
+
+def test_skipped_updates_are_counted_and_not_in_the_means():
+    agent, key = make_agent(tiny.CONFIG, SPEC), jax.random.key(1)
+    held = replay.from_episodes([episode(9, seed=s) for s in range(3)], SPEC, SIZES)
+    broken = dataclasses.replace(held, data=held.data._replace(reward=jnp.full_like(held.data.reward, jnp.nan)))
+    state = agent.init(jax.random.key(0))
+    _, _, metrics = loop.train_offline(agent, jax.tree.map(jnp.copy, state), broken, key, updates=3)
+    assert metrics["skipped_updates"] == metrics["non_finite/loss/reward"] == 3
+    assert np.isnan(metrics["loss/total"])
 
 
 @pytest.mark.parametrize(

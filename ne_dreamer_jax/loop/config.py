@@ -36,8 +36,9 @@ class LoopConfig:
     write_latents: bool = True
     """Whether the posterior latents of an update replace those in replay."""
     time_limits: Literal["marked", "unmarked", "terminal"] = "marked"
-    """How replay holds an episode that a time limit cut: ``is_last`` without ``is_terminal``; neither, as the released
-    code for DeepMind Control; or both, as the released code for DeepMind Lab."""
+    """How replay holds an episode that a time limit cut: ``is_last`` without ``is_terminal``, as the released code for
+    DeepMind Control; neither, as its own limit of 900 steps for DeepMind Lab, so that replayed returns go on into the
+    next episode; or both, as DeepMind Lab's own limits there."""
     latent_dtype: Literal["float32", "bfloat16"] = "float32"
     """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
     storage: Literal["pixels", "states", "host"] = "pixels"

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.loop.learn import draw_batch, learn_what_is_due
 from ne_dreamer_jax.replay import ring, storage
@@ -29,7 +30,8 @@ def train_offline(
       write_latents: whether posterior latents are written back into replay.
 
     Returns:
-      The new train state, replay, and the metrics' means over the updates, float32 [].
+      The new train state, replay, and the metrics, float32 []: means over the updates that were made, NaN where none
+      was, as those whose numbers are not finite are skipped; ``skipped_updates`` and ``non_finite/...`` count these.
 
     Raises:
       ValueError: replay holds too few steps for a sequence, or no update is asked for.
@@ -54,8 +56,9 @@ def _train(
         batch = jax.eval_shape(partial(draw_batch, agent, kept), replay, key)
         shapes = jax.eval_shape(agent.train_step, state, batch)[2]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        before = state.update
         state, replay, sums = learn_what_is_due(agent, kept, write_latents, updates, state, replay, key, sums)
-        count = jnp.maximum(updates, 1).astype(jnp.float32)
-        return state, replay, {name: value / count for name, value in sums.items()}
+        made = (state.update - before).astype(jnp.float32)
+        return state, replay, {name: x if guard.is_count(name) else x / made for name, x in sums.items()}
 
     return jax.jit(in_32_bits(run), donate_argnums=(0, 1))(state, replay, key, updates)

@@ -23,7 +23,7 @@ def reinforce_loss(
     r"""Score-function actor loss, :math:`-w_t (\mathrm{sg}(A_t) \log \pi(a_t | s_t) + \eta H[\pi(\cdot | s_t)])`.
 
     Args:
-      log_prob: ``[...]``, log-density of the raw sampled action at t; the only way for the advantage's gradient.
+      log_prob: ``[...]``, log-density of the raw sampled action at t, through which the advantage trains the actor.
       advantage: ``[...]``, :math:`A_t = (R_t - v_t) / \max(1, S)`; receives no gradient.
       entropy: ``[...]``, in nats.
       weight: ``[...]``; receives no gradient.
@@ -52,7 +52,8 @@ def dynamics_loss(
     r"""Actor loss backpropagated through the world model, :math:`-w_t (R_t / \max(1, S) + \eta H[\pi(\cdot | s_t)])`.
 
     The return must depend on the policy through reparameterised actions (continuous ones) and the imagined states. A
-    baseline would change no gradient, so there is none.
+    baseline would change no gradient, so there is none. Whether an action is also trained for how it moves the states
+    in which later ones are chosen is decided where these are: Dreamer's code holds the actor's inputs fixed.
 
     Args:
       normalized_return: ``[...]``, :math:`R_t / \max(1, S)`, with gradients.

@@ -123,9 +123,10 @@ def next_embedding_loss(
 
     Source: NE-Dreamer, "Next-embedding predictive alignment".
     """
-    if predicted.ndim != 3 or is_first.shape != predicted.shape[:2]:
+    if predicted.ndim != 3 or embedding.shape != predicted.shape or is_first.shape != predicted.shape[:2]:
         raise ValueError(
-            f"expected predicted [B, T, E] and is_first [B, T], got {predicted.shape} and {is_first.shape}"
+            f"expected predicted and embedding [B, T, E] and is_first [B, T], got {predicted.shape}, {embedding.shape} "
+            f"and {is_first.shape}"
         )
     length = predicted.shape[1]
     if not 0 <= shift < length:

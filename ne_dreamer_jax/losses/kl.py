@@ -32,8 +32,8 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
     """KL(p || q) = sum_k p_k (log p_k - log q_k) of categorical distributions.
 
     Args:
-      p_logits: ``[..., K]``, normalised or not.
-      q_logits: ``[..., K]``, likewise.
+      p_logits: ``[..., K]``, normalised or not; ``-inf`` masks a class, which then adds nothing.
+      q_logits: ``[..., K]``, likewise; a class that it alone masks makes the divergence infinite.
 
     Returns:
       float32 ``[...]``, in nats.
@@ -44,7 +44,9 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
     expect_same(p_logits=p_logits, q_logits=q_logits)
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
-    return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
+    possible = log_p > -jnp.inf  # 0 log 0 = 0, and so its gradients
+    ratio = jnp.where(possible, log_p, 0.0) - jnp.where(possible, log_q, 0.0)
+    return jnp.sum(jnp.where(possible, jnp.exp(log_p) * ratio, 0.0), axis=-1)
 
 
 def balanced_kl(

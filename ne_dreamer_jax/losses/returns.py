@@ -107,4 +107,5 @@ def return_scale(low: jax.Array, high: jax.Array, floor: float = 1.0) -> jax.Arr
 
     The floor keeps small returns (sparse rewards not yet found) from being blown up into noise.
     """
-    return jnp.maximum(jax.lax.stop_gradient(high - low), floor)
+    low, high = jax.lax.stop_gradient((low.astype(jnp.float32), high.astype(jnp.float32)))
+    return jnp.maximum(high - low, floor)

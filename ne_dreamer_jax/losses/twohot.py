@@ -7,13 +7,17 @@ import jax.numpy as jnp
 
 
 def symlog(x: jax.Array) -> jax.Array:
-    """sign(x) log(1 + |x|), the inverse of `symexp`."""
-    return jnp.sign(x) * jnp.log1p(jnp.abs(x))
+    """sign(x) log(1 + |x|), the inverse of `symexp`; float32, of the shape of ``x``. Its derivative at 0 is 1."""
+    x = jnp.asarray(x, jnp.float32)
+    magnitude = jnp.log1p(jnp.where(x < 0.0, -x, x))
+    return jnp.where(x < 0.0, -magnitude, magnitude)
 
 
 def symexp(x: jax.Array) -> jax.Array:
-    """sign(x) (exp(|x|) - 1), the inverse of `symlog`."""
-    return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+    """sign(x) (exp(|x|) - 1), the inverse of `symlog`; float32, of the shape of ``x``. Its derivative at 0 is 1."""
+    x = jnp.asarray(x, jnp.float32)
+    magnitude = jnp.expm1(jnp.where(x < 0.0, -x, x))
+    return jnp.where(x < 0.0, -magnitude, magnitude)
 
 
 def symexp_bins(count: int = 255, limit: float = 20.0) -> jax.Array:

@@ -92,7 +92,7 @@ class TransformerLayer(nn.Module):
         normed = LayerNorm(self.dtype, name="attention_norm")(x)
         qkv = Linear(3 * c.width, kernel_init=start, dtype=self.dtype, name="qkv")(normed)
         query, key, value = jnp.split(qkv.reshape(*x.shape[:-1], 3 * c.heads, c.width // c.heads), 3, axis=-2)
-        # In float32 throughout: at 2T tokens it costs next to nothing beside the linear layers.
+        # Float32 operands: at 2T tokens they cost next to nothing beside the linear layers.
         query, key, value = (part.astype(jnp.float32) for part in (query, key, value))
         attended = jax.nn.dot_product_attention(query, key, value, mask=mask[:, None])
         x = x + Linear(c.width, dtype=self.dtype, name="out")(attended.reshape(x.shape))

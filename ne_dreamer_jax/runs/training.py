@@ -24,7 +24,7 @@ from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.agents import guard, make_agent
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
-from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.config import Config, check
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.base import Env
 from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
@@ -77,6 +77,7 @@ def build(config: Config, env: Env | VectorEnv | None = None, mesh: Mesh | None 
     Raises:
       ValueError: what does not fit together, or not into memory.
     """
+    check(config)
     if env is None:
         env = env_configs.make(config.env)
     else:

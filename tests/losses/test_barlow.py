@@ -172,7 +172,7 @@ def test_no_extra_matrix_is_kept_for_the_off_diagonal():
 @pytest.mark.parametrize(
     ("shapes", "options", "message"),
     [
-        (((2, 5, 4), (2, 5, 3), (2, 5)), {}, "one shape"),
+        (((2, 5, 4), (2, 5, 3), (2, 5)), {}, "embedding \\[B, T, E\\]"),
         (((2, 5, 4), (2, 5, 4), (5, 2)), {}, "is_first"),
         (((2, 5, 4), (2, 5, 4), (2, 5)), {"shift": 5}, "shift < T = 5"),
         (((2, 5, 4), (2, 5, 4), (2, 5)), {"shift": -1}, "shift"),

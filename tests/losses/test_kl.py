@@ -38,6 +38,16 @@ def test_categorical_kl_equals_scipy_and_ignores_normalisation():
     np.testing.assert_allclose(categorical_kl(jnp.asarray(p), jnp.asarray(p)), 0, atol=1e-6)
 
 
+def test_a_class_that_is_masked_adds_nothing_to_the_divergence_nor_to_its_gradients():
+    p, q = jnp.asarray([0.3, -0.2, -jnp.inf]), jnp.asarray([-1.0, 0.5, -jnp.inf])
+    value, gradients = jax.value_and_grad(categorical_kl, argnums=(0, 1))(p, q)
+    want, expected = jax.value_and_grad(categorical_kl, argnums=(0, 1))(p[:2], q[:2])
+    np.testing.assert_allclose(value, want, rtol=1e-6)
+    for gradient, without in zip(gradients, expected, strict=True):
+        np.testing.assert_allclose(gradient, [*without, 0.0], rtol=1e-5, atol=1e-7)
+    assert categorical_kl(jnp.zeros(3), q) == jnp.inf
+
+
 @pytest.mark.parametrize("unimix", [0.0, 0.01])
 def test_balanced_kl_sums_over_latents_and_clips_after_the_sum(unimix):
     posterior, prior = logits(3, scale=0.7), logits(4, scale=0.7)

@@ -26,6 +26,14 @@ def test_symlog_and_symexp_are_inverse_and_odd():
     np.testing.assert_allclose(symlog(x), np.sign(x) * np.log1p(np.abs(np.asarray(x, np.float64))), rtol=1e-6)
 
 
+@pytest.mark.parametrize("function", [symlog, symexp])
+def test_symlog_and_symexp_have_slope_one_at_zero_and_compute_in_float32(function):
+    np.testing.assert_allclose(jax.vmap(jax.grad(function))(jnp.asarray([0.0, -0.0, 1e-6, -1e-6])), 1.0, rtol=1e-5)
+    for dtype in (jnp.bfloat16, jnp.float16):
+        np.testing.assert_array_equal(function(jnp.asarray(12, dtype)), function(jnp.float32(12)))
+        assert function(jnp.zeros(2, dtype)).dtype == jnp.float32
+
+
 @pytest.mark.parametrize("count", [2, 40, 41, 255])
 def test_bins_are_antisymmetric_increasing_and_symexp_spaced(count):
     bins = np.asarray(symexp_bins(count))

@@ -77,7 +77,7 @@ class AgentConfig:
     """Weight of every named loss; the keys must be exactly the names of the losses."""
     batch_size: Annotated[int, Range(1, 1_000_000)] = 16
     """B, sequences in a batch."""
-    batch_length: Annotated[int, Range(1, 1_000_000)] = 64
+    batch_length: Annotated[int, Range(2, 1_000_000)] = 64
     """T, steps in a sequence."""
     microbatches: Count = 1
     """Parts in which an update's sequences, and the trajectories imagined from them, go one after the other through
@@ -85,7 +85,8 @@ class AgentConfig:
     losses are taken over the whole batch; of what those need for the gradient there is one part in memory at a time,
     for one more forward pass. Divides ``batch_size``."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32."""
+    """Of the matrix products: float32 or bfloat16. Parameters, statistics and losses are float32. (GPUs with
+    TensorFloat-32 take it for float32 products, unless JAX's ``jax_default_matmul_precision`` says otherwise.)"""
 
     def __post_init__(self) -> None:
         ranges.check(self)
@@ -178,7 +179,9 @@ def make_world_model_agent(config: AgentConfig, spec: EnvSpec) -> Agent:
         return total, (rollout.latent, scale, metrics)
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Latent, Metrics]:
-        shapes.check(_batch_shapes(config, spec, *(*batch.reward.shape, 1, 1)[:2]), batch, "the agent")
+        if batch.reward.ndim != 2:
+            raise ValueError(f"batch.reward: expected [B, T], got {list(batch.reward.shape)}")
+        shapes.check(_batch_shapes(config, spec, *batch.reward.shape), batch, "the agent")
         key, loss_key = jax.random.split(state.key)
         grads, (latent, scale, metrics) = jax.grad(losses, has_aux=True)(state.params, state, loss_key, batch)
         named = {name: metrics[f"loss/{name}"] for name in config.loss_scales}

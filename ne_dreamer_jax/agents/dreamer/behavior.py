@@ -67,7 +67,8 @@ class BehaviorConfig:
     keeps a policy from the ends of tanh, where next to no gradient reaches the actor (rlkit's soft actor-critic has it,
     averaged over the components, at 1e-3). 0 as in the paper and DreamerV3; discrete policies have no such means."""
     gradient: Literal["reinforce", "dynamics"] = "reinforce"
-    """How the actor is trained: by the score function, or through the world model."""
+    """How the actor is trained: by the score function, or through the world model. There an action's gradient takes
+    all ways to later rewards, that through the policy's later choices included (Dreamer's code leaves that one out)."""
     slow_rate: Annotated[float, Range(0.0, 1.0, above=True)] = 0.02
     """Share of the critic that moves into the slow critic at each update."""
     slow_scale: NonNegative = 1.0
@@ -174,7 +175,7 @@ class Judgement(NamedTuple):
     """What the heads say of states [...]."""
 
     reward: Array  # float32 [...], received on arrival
-    discount: Array  # float32 [...], the probability of going on; it contains the discount
+    discount: Array  # float32 [...], the discount times the probability of going on
     value: Array  # float32 [...]
     logits: Array  # float32 [..., bins], the critic's
     slow_value: Array  # float32 [...]

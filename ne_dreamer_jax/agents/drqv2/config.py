@@ -78,10 +78,12 @@ class DrQv2Config:
     noise_clip: NonNegative = 0.3
     """Bound of the noise in the actions of an update (not in those of acting)."""
     random_steps: CountOrNone = SEED_FRAMES // 2
-    """Agent steps of uniformly random actions; the first update comes right after them."""
+    """Agent steps of uniformly random actions; the first update comes right after them, so that ``loop.prefill`` is the
+    same."""
     steps_per_update: Positive = 2.0
-    """Agent steps that go by for each update. The noise in an update follows from it; how often the loop learns is
-    ``loop.replay_ratio`` = batch_size * (frame_stack + n_step) / steps_per_update."""
+    """Agent steps that go by for each update, from which the noise in an update follows. How often the loop learns is
+    ``loop.replay_ratio`` = batch_size * (frame_stack + n_step) / steps_per_update: `config.override` keeps the two in
+    step, and `config.check` refuses a run in which they are not."""
 
     def __post_init__(self) -> None:
         ranges.check(self)
