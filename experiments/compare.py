@@ -35,6 +35,30 @@ REFUSED = 2
 """Exit code of a command whose arguments do not fit, such as a method that can't act in the task."""
 
 
+class Asked(NamedTuple):
+    """What all runs have in common: options of `experiments.train`."""
+
+    preset: str
+    size: str | None
+    task: str | None
+    assignments: Sequence[str]
+
+    def options(self, method: str, seed: int) -> list[str]:
+        """One run's, as they are typed."""
+        options = ["--preset", self.preset]
+        for option, value in (("--task", self.task), ("--size", self.size)):
+            options += [] if value is None else [option, value]
+        for assignment in self.assignments:
+            options += ["--set", assignment]
+        return [*options, "--method", method, "--seed", str(seed)]
+
+    def config(self, method: str, seed: int) -> Config:
+        """One run's settings. Raises ValueError where they do not fit together."""
+        from experiments.train import configure
+
+        return configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
+
+
 class Found(NamedTuple):
     """A run that has been evaluated at least once."""
 
@@ -58,7 +82,7 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
     )
     @click.option("--seeds", type=click.IntRange(1), default=2, show_default=True, help="Runs of each method.")
     @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart", show_default=True)
-    @click.option("--size", type=Name("size", names.SIZES), help="Parameters, roughly; default: the preset's.")
+    @click.option("--size", type=Name("size", names.SIZES), help="Parameters, roughly; drqv2 has one size.")
     @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As for experiments.train.")
     @click.option("--draw", "only_draw", is_flag=True, help="Train nothing; draw the runs that are there.")
     def main(
@@ -72,13 +96,9 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
         only_draw: bool,
     ) -> None:
         quiet()
-        options = ["--preset", preset]
-        for option, value in (("--task", task), ("--size", size)):
-            options += [] if value is None else [option, value]
-        for assignment in assignments:
-            options += ["--set", assignment]
-        failed = {} if only_draw else train_missing(directory, chosen or methods, seeds, options)
         with refusing(run_directory.RefusedError, ValueError):
+            asked = Asked(preset, size, task, assignments)
+            failed = {} if only_draw else train_missing(directory, chosen or methods, seeds, asked)
             found = find(directory)
             for line in draw(found, directory / "comparison.png"):
                 say(line)
@@ -91,9 +111,7 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
     return main
 
 
-def train_missing(
-    directory: Path, methods: Sequence[str], seeds: int, options: Sequence[str]
-) -> dict[tuple[str, int], int]:
+def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: Asked) -> dict[tuple[str, int], int]:
     """Trains what is not finished yet, and goes on where a run fails.
 
     A method that can't act in the task is refused once, not for every seed.
@@ -103,15 +121,16 @@ def train_missing(
 
     Raises:
       SystemExit: a run was stopped by a signal, and so is this process.
+      RefusedError, ValueError: as `finished`.
     """
     failed: dict[tuple[str, int], int] = {}
     for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
         for method in methods:
             path = directory / method.replace("/", "-") / f"seed{seed}"
-            if finished(path) or failed.get((method, 0)) == REFUSED:
+            if failed.get((method, 0)) == REFUSED or finished(path, asked, method, seed):
                 continue
             say(f"\n{method}, seed {seed}: {path}")
-            code = train(path, [*options, "--method", method, "--seed", str(seed)])
+            code = train(path, asked.options(method, seed))
             if code < 0 or code > 128:
                 raise SystemExit(code)
             if code:
@@ -125,15 +144,19 @@ def train(path: Path, options: Sequence[str]) -> int:
     return subprocess.run(arguments, check=False).returncode
 
 
-def finished(path: Path) -> bool:
-    """Whether a run has had its last evaluation."""
+def finished(path: Path, asked: Asked, method: str, seed: int) -> bool:
+    """Whether a run has had the last evaluation that is asked for.
+
+    Raises:
+      RefusedError: it is a run of other settings, or its configuration can't be read.
+      ValueError: the settings do not fit together, or its metrics can't be read.
+    """
     files = run_directory.RunDirectory(path)
     if not files.config.exists():
         return False
-    from ne_dreamer_jax.config import Config
-    from ne_dreamer_jax.runs import metrics
+    from ne_dreamer_jax.runs import metrics, resume
 
-    budget = run_directory.read_config(path, Config).loop.env_steps
+    budget = resume.settle(path, asked.config(method, seed)).loop.env_steps
     return any("eval/return" in line and line["env_step"] >= budget for line in metrics.read(files.metrics))
 
 

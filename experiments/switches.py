@@ -12,13 +12,14 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ne_dreamer_jax.commands.options import Name, Task, UserPath, refusing, say
+from ne_dreamer_jax.files import write_text
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
 from ne_dreamer_jax.system.quiet import quiet
@@ -64,7 +65,7 @@ def main(
     seeds: int,
     assignments: tuple[str, ...],
 ) -> None:
-    """Trains what OUT does not hold yet, adds a line for each variant and task, and prints the comparison."""
+    """Trains what OUT does not hold yet, keeps a line for each variant and task in it, and prints the comparison."""
     quiet()
     from experiments.train import configure
 
@@ -77,29 +78,38 @@ def main(
             for task in tasks or (None,)
             for variant in variants
         }
-    lines = _read(out)
-    compared: list[dict[str, Any]] = []
-    for (_, variant), config in made.items():
-        compared.append(_find(lines, config, variant, seeds) or _add(out, config, variant, seeds))
+        lines = _read(out)
+    compared = [_results(out, lines, config, variant, seeds) for (_, variant), config in made.items()]
     say("")
     for row in table(compared):
         say(row)
 
 
-def _add(out: Path, config: Config, variant: str, seeds: int) -> dict[str, Any]:
-    """Trains a variant, and adds its line to the file."""
-    say(f"{config.env.task}, {variant}: {seeds} seeds")
-    line: dict[str, Any] = {}
-    for line in train(config, variant, seeds):
-        say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("a") as file:
-        file.write(json.dumps(line) + "\n")
-    return line
+def _results(out: Path, lines: list[dict[str, Any]], config: Config, variant: str, seeds: int) -> dict[str, Any]:
+    """A variant's line with so many seeds; those that the file's ``lines`` lack are trained, and kept one by one."""
+    same = [line for line in lines if line["config"] == plain(config) and line["variant"] == variant]
+    found = max(same, key=lambda line: line["seeds"], default=None)
+    done = 0 if found is None else found["seeds"]
+    if done < seeds:
+        say(f"{config.env.task}, {variant}: {seeds} seeds")
+        others = [line for line in lines if line not in same]
+        for line in train(config, variant, range(done, seeds), found):
+            say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
+            lines[:], found = [*others, line], line
+            out.parent.mkdir(parents=True, exist_ok=True)
+            write_text(out, "".join(json.dumps(each) + "\n" for each in lines))
+    assert found is not None
+    return found | {"seeds": seeds, "curves": found["curves"][:seeds]}
 
 
-def train(config: Config, variant: str, seeds: int) -> Iterator[dict[str, Any]]:
-    """After each seed what is known so far: curves of the returns of the policies' modes."""
+def train(
+    config: Config, variant: str, seeds: Sequence[int], before: Mapping[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
+    """After each seed what is known so far: curves of the returns of the policies' modes.
+
+    Args:
+      before: what was known of the seeds before these.
+    """
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -116,8 +126,9 @@ def train(config: Config, variant: str, seeds: int) -> Iterator[dict[str, Any]]:
     repeat = config.env.action_repeat * config.loop.num_envs
     interval = max(1, (config.loop.eval_every or config.loop.env_steps) // repeat)
     ends = [*range(interval, loop.budget.vector_steps, interval), loop.budget.vector_steps]
-    curves: list[list[float]] = []
-    for seed in range(seeds):
+    curves: list[list[float]] = [] if before is None else list(before["curves"])
+    minutes = 0.0 if before is None else before["minutes"]
+    for seed in seeds:
         state, curve, step = loop.init(jax.random.key(seed)), [], 0
         for end in ends:
             state, _ = loop.chunk(state, jnp.asarray(end - step, jnp.int32))
@@ -129,14 +140,34 @@ def train(config: Config, variant: str, seeds: int) -> Iterator[dict[str, Any]]:
             "variant": variant,
             "seeds": seed + 1,
             "env_steps": [end * repeat for end in ends],
-            "curves": curves,
-            "minutes": (time.monotonic() - began) / 60,
+            "curves": list(curves),
+            "minutes": minutes + (time.monotonic() - began) / 60,
             "config": plain(config),
         }
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    """The file's lines. Raises ValueError where it can't be read, or holds something else."""
+    if not path.exists():
+        return []
+    try:
+        texts = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeError) as error:
+        raise ValueError(f"{path} can't be read: {error}") from error
+    lines = []
+    for number, text in enumerate(texts, start=1):
+        try:
+            line = json.loads(text)
+            fits = {"task", "variant", "config", "seeds", "curves", "minutes"} <= line.keys()
+        except (ValueError, AttributeError):
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"{path}, line {number}: expected results of a variant, as this command writes them, got "
+                f"{text[:80]!r}; remove the line, or choose another file"
+            )
+        lines.append(line)
+    return lines
 
 
 def plain(config: Config) -> dict[str, Any]:
@@ -144,11 +175,6 @@ def plain(config: Config) -> dict[str, Any]:
     from ne_dreamer_jax import settings
 
     return json.loads(json.dumps(settings.to_dict(config)))
-
-
-def _find(lines: Sequence[dict[str, Any]], config: Config, variant: str, seeds: int) -> dict[str, Any] | None:
-    wanted = {"config": plain(config), "variant": variant, "seeds": seeds}
-    return next((line for line in lines if all(line[name] == value for name, value in wanted.items())), None)
 
 
 def table(lines: Sequence[dict[str, Any]]) -> list[str]:

@@ -263,6 +263,11 @@ def override(config: Config, assignment: str) -> Config:
     """
     path, _, task = assignment.partition("=")
     if path.strip() == "env.task":
+        if isinstance(config.agent, DrQv2Config) and drqv2.for_task(task.strip()) != drqv2.for_task(config.env.task):
+            raise ValueError(
+                f"env.task: DrQ-v2 has other settings for {task.strip()} than for {config.env.task}; expected the task "
+                "before the method: --task on the command line"
+            )
         return replace(config, env=env_configs.for_task(task.strip(), config.env))
     changed = settings.override(config, assignment)
     old, new = config.agent, changed.agent

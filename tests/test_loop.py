@@ -430,3 +430,16 @@ def test_the_whole_agent_learns_in_the_loop(whole):
         halves, _ = loop.chunk(halves, five)
     assert_same(halves, state)
     assert loop.chunk._cache_size() == 1
+
+
+def test_virtual_devices_have_no_more_memory_than_the_host(monkeypatch):
+    from ne_dreamer_jax.envs.vector import as_vector
+    from ne_dreamer_jax.loop.make import fit_memory, row_shapes
+    from ne_dreamer_jax.replay import storage
+
+    env = counting.env()
+    agent, kept = counting.stub(env.spec), storage.pixels()
+    row, budget = row_shapes(CONFIG, as_vector(env), agent, kept), make().budget
+    monkeypatch.setattr(memory, "available", lambda: 10**9)
+    alone, divided = (fit_memory(agent, kept, row, budget, jnp.float32, devices)[0] for devices in (1, 8))
+    assert divided <= alone < 10**9

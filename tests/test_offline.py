@@ -66,6 +66,23 @@ def test_an_agent_learns_from_episodes_without_an_environment():
     assert np.any(held.data.latent.deter), "latents are written back"
 
 
+def test_an_agent_that_learns_again_is_not_compiled_again():
+    agent = make_agent(tiny.CONFIG, SPEC)
+    held = replay.from_episodes([episode(9, seed=s) for s in range(3)], SPEC, SIZES)
+    state, traced = agent.init(jax.random.key(0)), []
+
+    def train_step(state, batch):
+        traced.append(batch)
+        return agent.train_step(state, batch)
+
+    counting = agent._replace(train_step=train_step)
+    state, held, _ = loop.train_offline(counting, state, held, jax.random.key(1), updates=1)
+    times = len(traced)
+    state, held, _ = loop.train_offline(counting, state, held, jax.random.key(2), updates=2)
+    assert len(traced) == times
+    assert int(state.update) == 3
+
+
 def test_skipped_updates_are_counted_and_not_in_the_means():
     agent, key = make_agent(tiny.CONFIG, SPEC), jax.random.key(1)
     held = replay.from_episodes([episode(9, seed=s) for s in range(3)], SPEC, SIZES)

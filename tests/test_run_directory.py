@@ -104,6 +104,16 @@ def test_a_crash_before_the_configuration_was_written_starts_anew(tmp_path):
         assert run_directory.read_config(tmp_path, Config) == Config()
 
 
+@pytest.mark.parametrize("left", ["checkpoints", "metrics.jsonl"])
+def test_a_run_whose_configuration_is_gone_is_refused(tmp_path, left):
+    with run_directory.claim(tmp_path, Config()):
+        (tmp_path / left).mkdir()
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(RefusedError, match=f"holds {left} of a run whose config.json is gone"):  # noqa: SIM117
+        with run_directory.claim(tmp_path, Config()):
+            pass
+
+
 def test_reading_what_is_no_run_or_of_another_version(tmp_path):
     with pytest.raises(RefusedError, match="expected a run directory"):
         run_directory.read_config(tmp_path, Config)

@@ -44,7 +44,9 @@ FLAGS = {  # option -> the setting that it changes
 )
 @click.option("--task", type=Task(), help="What to learn, such as dmc/walker_walk.")
 @click.option("--method", type=Name("method", names.METHODS), help=f"One of {', '.join(names.METHODS)}.")
-@click.option("--size", type=Name("size", names.SIZES), help=f"Parameters, roughly: {', '.join(names.SIZES)}.")
+@click.option(
+    "--size", type=Name("size", names.SIZES), help=f"Parameters, roughly: {', '.join(names.SIZES)}; drqv2 has one size."
+)
 @click.option("--obs", type=Name("observation", names.OBSERVATIONS), metavar="KIND", help="pixels, vector or both.")
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), metavar="N", help="The same seed gives the same run, to the bit."

@@ -206,7 +206,8 @@ def fit_memory(
     train = jax.eval_shape(agent.init, jax.random.key(0))
     # The state is on every device; the work of an update is divided.
     learner = devices * _nbytes(train) + agent.working_bytes(train.params)
-    available = int(ring.FREE_FRACTION * max(0, devices * memory.available() - learner))
+    memories = jax.process_count() if jax.default_backend() == "cpu" else devices  # virtual devices share the host's
+    available = int(ring.FREE_FRACTION * max(0, memories * memory.available() - learner))
     ring.check_capacity(row, budget.capacity, budget.num_envs, latent_dtype, available)
     replay_bytes = ring.nbytes(row, budget.capacity, budget.num_envs, latent_dtype)
     if storage.host_bytes:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -44,13 +45,27 @@ def train_offline(
             f"replay: expected more than agent.batch_length {length} steps, got {int(replay.size)}; take shorter "
             "sequences or more data"
         )
-    return _train(agent, write_latents, state, replay, key, jnp.asarray(updates, jnp.int32))
+    program = _program(_Learner(agent), write_latents)
+    return program(state, replay, key, jnp.asarray(updates, jnp.int32))
 
 
-def _train(
-    agent: Agent, write_latents: bool, state: Any, replay: ring.Replay, key: Array, updates: Array
-) -> tuple[Any, ring.Replay, Metrics]:
-    kept = storage.pixels()
+class _Learner:
+    """An agent, by which its program is found again; the same update is the same agent."""
+
+    def __init__(self, agent: Agent) -> None:
+        self.agent = agent
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Learner) and self.agent.train_step is other.agent.train_step
+
+    def __hash__(self) -> int:
+        return id(self.agent.train_step)
+
+
+@lru_cache(maxsize=8)
+def _program(learner: _Learner, write_latents: bool) -> Callable[..., tuple[Any, ring.Replay, Metrics]]:
+    """Compiled once for an agent, however often it learns."""
+    agent, kept = learner.agent, storage.pixels()
 
     def run(state: Any, replay: ring.Replay, key: Array, updates: Array) -> tuple[Any, ring.Replay, Metrics]:
         batch = jax.eval_shape(partial(draw_batch, agent, kept), replay, key)
@@ -61,4 +76,4 @@ def _train(
         made = (state.update - before).astype(jnp.float32)
         return state, replay, {name: x if guard.is_count(name) else x / made for name, x in sums.items()}
 
-    return jax.jit(in_32_bits(run), donate_argnums=(0, 1))(state, replay, key, updates)
+    return jax.jit(in_32_bits(run), donate_argnums=(0, 1))

@@ -75,7 +75,9 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
       mode: which actions the agent takes, its policy's mode or samples.
     """
     run = jax.jit(
-        in_32_bits(partial(_run, env, agent, chunk_steps, mode)), static_argnames=("frames", "steps"), donate_argnums=1
+        in_32_bits(partial(_run, env, agent, chunk_steps, max_steps, mode)),
+        static_argnames=("frames", "steps"),
+        donate_argnums=1,
     )
 
     @in_32_bits
@@ -91,7 +93,7 @@ def make_play(env: VectorEnv, agent: Agent, max_steps: int, chunk_steps: int = S
                 clips.append(images[counts])
             if steps:
                 seen.append(jax.device_get(kept))
-            if bool(jnp.all(carry.done)):
+            if bool(jnp.all(carry.done | (carry.lengths >= max_steps))):
                 break
         if env.release is not None:
             env.release(carry.env)
@@ -132,6 +134,7 @@ def _run(
     env: VectorEnv,
     agent: Agent,
     length: int,
+    max_steps: int,
     mode: Mode,
     params: Any,
     carry: Playing,
@@ -148,7 +151,7 @@ def _run(
         policy, action = agent.act(params, carry.policy, timestep, act_key, mode=mode)
         action = jnp.where(random, random_action(agent.spec.action, random_key, action.shape[0]), action)
         policy = policy._replace(prev_action=action)
-        counts, cuts = ~carry.done, env.cuts(env_state)
+        counts, cuts = ~carry.done & (carry.lengths < max_steps), env.cuts(env_state)
         new = Playing(
             env=env_state,
             policy=policy,
@@ -156,7 +159,7 @@ def _run(
             returns=carry.returns + jnp.where(counts, timestep.reward, 0.0),
             lengths=carry.lengths + (counts & ~timestep.is_first).astype(jnp.int32),
             complete=jnp.where(counts, cuts.faults + cuts.bad_actions == 0, carry.complete),
-            done=carry.done | timestep.is_last,
+            done=carry.done | (counts & timestep.is_last),
         )
         clip = (shown.obs[next(iter(images_of(env.spec)))][0], counts[0]) if frames else None
         kept = Steps(dict(shown.obs), action, shown.reward, shown.is_terminal, policy.latent, counts) if steps else None

@@ -68,6 +68,7 @@ class Restored(NamedTuple):
     checkpoint: Checkpoint
     items: dict[str, Any]
     skipped: list[str]  # why checkpoints that came first were passed over, a sentence each
+    damaged: list[tuple[Checkpoint, str]]  # of these, those of which an item is damaged, and which
 
 
 def save(
@@ -203,18 +204,41 @@ def restore(
     chosen = best(candidates)
     if prefer == "best" and chosen is not None:
         candidates = [chosen, *(checkpoint for checkpoint in candidates if checkpoint is not chosen)]
+    damaged: list[tuple[Checkpoint, str]] = []
     for checkpoint in candidates:
         for item, tree in like.items():
             check_fit(checkpoint, item, tree)
-        try:
-            items = {item: _load(checkpoint, item, tree) for item, tree in like.items()}
-        except DamagedError as error:
-            skipped.append(str(error))
-            continue
-        return Restored(checkpoint, items, skipped)
+        items: dict[str, Any] = {}
+        for item, tree in like.items():
+            try:
+                items[item] = _load(checkpoint, item, tree)
+            except DamagedError as error:
+                skipped.append(str(error))
+                damaged.append((checkpoint, item))
+                break
+        else:
+            return Restored(checkpoint, items, skipped, damaged)
     raise DamagedError(
         f"no checkpoint in {directory} is intact; to begin anew, choose another directory. {' '.join(skipped)}"
     )
+
+
+def take_out(found: Checkpoint, item: str, scored: str = "agent") -> None:
+    """Takes a damaged item out of a checkpoint, so that nobody counts on it; its files stay, as ``damaged-ITEM``.
+
+    Args:
+      scored: the item that the score is of; without it the checkpoint has none.
+
+    Raises:
+      OSError: the folder can't be written to.
+    """
+    items = {name: leaves for name, leaves in found.items.items() if name != item}
+    files = {name: found.files[name] for name in items}
+    _write_manifest(found.path, found._replace(items=items, files=files, score=None if item == scored else found.score))
+    aside = found.path / f"damaged-{item}"
+    shutil.rmtree(aside, ignore_errors=True)
+    if (found.path / item).exists():
+        (found.path / item).rename(aside)
 
 
 def checkpoints(directory: Path) -> list[Checkpoint]:

@@ -3,7 +3,8 @@
 It takes over the train state of the other's newest good checkpoint, bit for bit: parameters, optimiser, return scale,
 its key and the number of updates. Replay and the environments are new, since what was seen under other settings, or in
 another task, may be no part of the new run; so it collects ``loop.prefill`` steps before it learns, with the policy
-that it took over, and counts its steps from 0. ``parent.json`` in its directory then says where the agent came from.
+that it took over, and counts its steps from 0, by which DrQ-v2 acts at random again at first, and with its first noise.
+``parent.json`` in its directory then says where the agent came from.
 """
 
 from __future__ import annotations

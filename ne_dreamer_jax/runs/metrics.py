@@ -120,7 +120,7 @@ def resume(path: Path, env_step: int) -> list[dict[str, Any]]:
     The file is replaced whole, so that it never stands half written.
     """
     kept = [line for line in read(path) if line["env_step"] <= env_step]
-    with replacing(path) as beside, Writer(beside) as writer:
+    with replacing(path, sync=True) as beside, Writer(beside) as writer:
         for line in kept:
             values = {name: value for name, value in line.items() if name not in COUNTERS}
             writer.write(StepCounts(*(line[counter] for counter in COUNTERS)), values)

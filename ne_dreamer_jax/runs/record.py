@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from ne_dreamer_jax.files import sync_file
 from ne_dreamer_jax.loop import LoopState
 from ne_dreamer_jax.replay.host_frames import HostFrames
 from ne_dreamer_jax.runs import checkpoint, metrics
@@ -120,6 +121,7 @@ class Saves:
             if jax.process_index() > 0:
                 return
         try:
+            self._sync_metrics()
             checkpoint.save(self._directory, counters.env_step, items, score=score)
         except checkpoint.SaveError as error:
             self.failed = True
@@ -129,6 +131,16 @@ class Saves:
         self.failed = False
         self._echo(f"Saved the {' and the '.join(items)} in {time.monotonic() - began:.1f} s.")
         self.prune()
+
+    def _sync_metrics(self) -> None:
+        """No checkpoint outlives the lines before it. Raises SaveError where they can't be brought to the disk."""
+        path = self._files.metrics
+        try:
+            if path.exists():
+                sync_file(path)
+        except OSError as error:
+            cause = error.strerror or error
+            raise checkpoint.SaveError(f"could not save a checkpoint in {self._directory}: {path}: {cause}") from error
 
     def prune(self, keep: int = 2) -> None:
         """Removes what `checkpoint.prune` removes; where that can't be, a line says so."""

@@ -144,9 +144,15 @@ def check_same(path: Path, config: Any, differences: Differences = settings.diff
     """Refuses a directory that holds a run of another configuration; touches nothing.
 
     Raises:
-      RefusedError: what differs, one line each.
+      RefusedError: what differs, one line each; or a run without its configuration.
     """
-    if not RunDirectory(path).config.exists():
+    files = RunDirectory(path)
+    if not files.config.exists():
+        if left := [place.name for place in (files.checkpoints, files.metrics) if place.exists()]:
+            raise RefusedError(
+                f"{path} holds {' and '.join(left)} of a run whose config.json is gone. Restore that, or choose "
+                "another --logdir"
+            )
         return
     different = differences(read_config(path, type(config)), config)
     if different:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE = 0.5
@@ -25,15 +26,19 @@ class Stop:
     A second SIGINT or SIGTERM acts as it always does; where the main thread does not come to that within `GRACE`, since
     it compiles or computes, the process ends there and then, with 128 + the signal's number, but for one in which
     somebody types. A second SIGHUP is none's wish, as a terminal that is closed sends several. A signal that was
-    ignored before (``nohup``, a job in a script's background) stays ignored.
+    ignored before (``nohup``, a job in a script's background) stays ignored. Python hears of signals in its main thread
+    alone: in another one, nothing changes.
     """
 
     def __init__(self, echo: Callable[[str], None]) -> None:
         self.signal: int | None = None
         self._twice = False  # whether a second one has come, as the watcher has it
         self._echo = echo
+        self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Stop:
+        if threading.current_thread() is not threading.main_thread():
+            return self
         heeded = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         self._before = {number: signal.signal(number, self._ask) for number in heeded}
         self._over = threading.Event()
@@ -46,6 +51,8 @@ class Stop:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if not self._before:
+            return
         self._over.set()
         signal.set_wakeup_fd(self._wakeup_before)
         self._waking.close()  # which ends the watcher

@@ -111,8 +111,7 @@ def train(
     Raises:
       checkpoint.DamagedError: there are checkpoints, and none is intact.
       run_directory.RefusedError: there is one of an agent of other shapes; or the metrics so far are damaged, or can't
-        be written.
-      ValueError: processes that train together see different checkpoints.
+        be written; or processes that train together see different checkpoints; or the run to begin with is gone.
     """
     if run.host is None:
         return _train(run, files, checkpoint_minutes, echo, parent)
@@ -161,11 +160,12 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
                 _tell(run, echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
+            if schedule.evaluates(step) and step < schedule.total:  # at the end everything is saved below
+                saves.if_best(state, counters, record.score(counters))
+            if schedule.evaluates(step) and missing:
                 if is_main_process:
                     draw(run, files, record, echo)
                 gc.collect()  # cycles that wait for their turn lie scattered, and keep whole pages: 10 kB a chunk
-                if step < schedule.total:  # at the end everything is saved below
-                    saves.if_best(state, counters, record.score(counters))
             (stopped_by,) = parallel.agreed(stop.signal or 0)
             if step == schedule.total or stopped_by:
                 break
@@ -315,10 +315,21 @@ def _start(
     env_step = restored.checkpoint.step
     echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
     _same_for_all(files, env_step)
+    if is_main_process:
+        _take_out(restored)
     if run.loop.frames is not None:
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
     return parallel.move(state, run.shapes), _lines(files, env_step) if is_main_process else []
+
+
+def _take_out(restored: checkpoint.Restored) -> None:
+    """Lets no checkpoint stand as whole that is damaged: it would keep the run from saving that step again."""
+    for found, item in restored.damaged:
+        try:
+            checkpoint.take_out(found, item)
+        except OSError as error:
+            raise run_directory.RefusedError(f"{found.path} can't be written to: {error.strerror or error}") from error
 
 
 def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
@@ -333,7 +344,10 @@ def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
 
 def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: LoopState, echo: Echo) -> LoopState:
     """The state with the agent of another run, which ``parent.json`` then names."""
-    train, origin = fork.agent(parent, like, echo)
+    try:
+        train, origin = fork.agent(parent, like, echo)
+    except (FileNotFoundError, ValueError) as error:  # it was there, and fitted, when the run began
+        raise run_directory.RefusedError(f"{files.parent} names a run to begin with: {error}") from error
     parallel.agreed(0)  # all have looked for a parent before one is written down
     if parallel.is_main_process():
         run_directory.write_parent(files, origin)
@@ -355,7 +369,7 @@ def _space(run: Run, files: RunDirectory) -> str:
 
 def _same_for_all(files: RunDirectory, env_step: int) -> None:
     if parallel.agreed(env_step) != (env_step,):
-        raise ValueError(
+        raise run_directory.RefusedError(
             f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
             f"{jax.process_index()}; put --logdir where all of them see it"
         )

@@ -40,7 +40,8 @@ def invoke(monkeypatch):
     monkeypatch.setattr(compare, "train", train)
 
     def invoke(command, *arguments):
-        result = CliRunner().invoke(command.main, [str(argument) for argument in arguments])
+        budget = ["--set", f"loop.env_steps={BUDGET}"] if "--draw" not in arguments else []
+        result = CliRunner().invoke(command.main, [*(str(argument) for argument in arguments), *budget])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
         return result.exit_code, result.output, started
@@ -71,6 +72,38 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, invoke):
     assert "1 unfinished" in output
     _, _, started = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
     assert started == [("r2dreamer", "seed0")]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--task", "dmc/cheetah_run"], "env.task: 'dmc/ball_in_cup_catch', now 'dmc/cheetah_run'"),
+        (["--set", "agent.optimizer.learning_rate=0.5"], "agent.optimizer.learning_rate"),
+    ],
+)
+def test_a_finished_run_of_other_settings_is_refused_with_what_differs(tmp_path, invoke, options, message):
+    invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
+    code, output, started = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1, *options)
+    assert code == 2
+    assert message in " ".join(output.split())
+    assert len(started) == 1
+
+
+def test_a_finished_run_that_is_to_have_more_steps_goes_on(tmp_path, invoke):
+    invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
+    asked = compare.Asked("quickstart", None, None, [f"loop.env_steps={2 * BUDGET}"])
+    run = tmp_path / "r2dreamer" / "seed0"
+    assert not compare.finished(run, asked, "r2dreamer", 0)
+    assert compare.finished(run, asked._replace(assignments=[f"loop.env_steps={BUDGET}"]), "r2dreamer", 0)
+
+
+@pytest.mark.parametrize("name", ["config.json", "metrics.jsonl"])
+def test_a_run_that_cant_be_read_is_named(tmp_path, invoke, name):
+    invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
+    (tmp_path / "r2dreamer" / "seed0" / name).write_text("{\n")
+    code, output, _ = invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
+    assert code == 2
+    assert name in output
 
 
 def test_a_method_that_fails_ends_no_other_and_is_named(tmp_path, invoke, monkeypatch):

@@ -15,10 +15,14 @@ RETURNS = {VARIANTS[0]: [[1.0, 10.0], [2.0, 12.0], [0.0, 11.0]], VARIANTS[1]: [[
 @pytest.fixture
 def invoke(monkeypatch, tmp_path):
     trained = []
+    stopping_at = {}
 
-    def train(config, variant, seeds):
+    def train(config, variant, seeds, before=None):
         trained.append((config.env.task, variant, config.agent.behavior.horizon))
-        for seed in range(seeds):
+        for seed in seeds:
+            assert before is None or seed == before["seeds"] or seed > seeds[0]
+            if seed == stopping_at.get(variant):
+                raise KeyboardInterrupt
             plain = switches.plain(config)
             yield {"task": config.env.task, "variant": variant, "seeds": seed + 1, "config": plain} | {
                 "env_steps": [50, 100],
@@ -32,6 +36,7 @@ def invoke(monkeypatch, tmp_path):
         done = CliRunner().invoke(switches.main, [str(tmp_path / "out.jsonl"), *arguments])
         return done.exit_code, done.output, trained
 
+    call.stopping_at = stopping_at
     return call
 
 
@@ -50,6 +55,32 @@ def test_variants_are_trained_once_and_compared(invoke, tmp_path):
     assert len(trained) == 3, "another configuration is another line"
     assert "| 20 24 22 | 22.0 | 13.5 |  |  |" in output, "and compared with none of an earlier command"
     assert VARIANTS[0] not in output
+
+
+def test_seeds_that_are_there_are_kept_whatever_ends_the_command(invoke, tmp_path):
+    invoke.stopping_at[VARIANTS[0]] = 1
+    code, _, _ = invoke(VARIANTS[0], "--seeds", "3")
+    assert code != 0
+    (line,) = map(json.loads, (tmp_path / "out.jsonl").read_text().splitlines())
+    assert line["seeds"] == 1
+    invoke.stopping_at.clear()
+    code, output, trained = invoke(VARIANTS[0], "--seeds", "3")
+    assert code == 0
+    assert "seed 0:" not in output
+    (line,) = map(json.loads, (tmp_path / "out.jsonl").read_text().splitlines())
+    assert line["curves"] == RETURNS[VARIANTS[0]]
+    _, output, again = invoke(VARIANTS[0], "--seeds", "2")
+    assert len(again) == len(trained) == 2, "fewer seeds are there already"
+    assert "| 10 12 | 11.0 |" in output
+
+
+@pytest.mark.parametrize("text", ["{", '{"config": 1}\n', "3\n", "\xff"])
+def test_a_file_with_something_else_in_it_is_refused_and_left_alone(invoke, tmp_path, text):
+    path = tmp_path / "out.jsonl"
+    path.write_bytes(text.encode("latin-1"))
+    code, output, trained = invoke(VARIANTS[0], "--seeds", "2")
+    assert (code, trained, path.read_bytes()) == (2, [], text.encode("latin-1"))
+    assert "out.jsonl" in output
 
 
 def test_a_variant_may_be_of_another_method_and_have_values_with_commas(invoke, monkeypatch):

@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from ne_dreamer_jax.runs import checkpoint, metrics, run_directory, training
+from ne_dreamer_jax.runs import checkpoint, metrics, record, run_directory, training
 from tests.experiments import stub, toy
 
 LAST = 120
@@ -152,6 +154,57 @@ def test_a_damaged_checkpoint_costs_only_time(finished, tmp_path):
     assert any("Passed over a damaged checkpoint" in line for line in lines)
     assert last_bits(tmp_path) == last_bits(finished[0])
     assert measured(tmp_path) == measured(finished[0])
+
+
+def damage(found, item):
+    path = found.path / item / "arrays"
+    path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:])
+
+
+@pytest.mark.strict
+@pytest.mark.parametrize("item", ["agent", "loop"])
+def test_a_step_whose_checkpoint_is_damaged_is_saved_again(finished, tmp_path, item):
+    train(tmp_path, terminate, "env step 80", minutes=0)
+    damage(checkpoint.checkpoints(tmp_path / "checkpoints")[0], item)
+    _, lines = train(tmp_path, terminate, "env step 80")
+    assert any("Passed over a damaged checkpoint" in line for line in lines)
+    _, lines = train(tmp_path)
+    assert any("Going on from" in line and "000000000080" in line for line in lines)
+    assert last_bits(tmp_path) == last_bits(finished[0])
+    assert measured(tmp_path) == measured(finished[0])
+
+
+def test_no_checkpoint_is_given_up_for_a_damaged_one_at_the_end(finished, tmp_path):
+    train(tmp_path, terminate, "env step 112")
+    (before,) = (tmp_path / "checkpoints").glob("*112")
+    shutil.copytree(before, tmp_path / "kept")
+    train(tmp_path)
+    shutil.move(tmp_path / "kept", before)
+    damage(checkpoint.checkpoints(tmp_path / "checkpoints")[0], "loop")
+    assert train(tmp_path)[0] == 0
+    _, lines = train(tmp_path)
+    assert any("Going on from" in line and "000000000120" in line for line in lines)
+    assert last_bits(tmp_path) == last_bits(finished[0])
+
+
+def test_the_best_agent_is_kept_where_the_run_was_killed_right_after_its_evaluation(finished, tmp_path, monkeypatch):
+    def die(*_):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(record.Saves, "if_best", die)
+        with pytest.raises(Killed):
+            train(tmp_path, minutes=0)
+    train(tmp_path, minutes=0)
+    best = [checkpoint.best(checkpoint.checkpoints(path / "checkpoints")) for path in (tmp_path, finished[0])]
+    assert best[0].step == best[1].step
+    assert best[0].score == best[1].score
+
+
+def test_a_run_in_another_thread_is_a_run(finished, tmp_path):
+    with ThreadPoolExecutor(1) as threads:
+        assert threads.submit(train, tmp_path).result()[0] == 0
+    assert last_bits(tmp_path) == last_bits(finished[0])
 
 
 def test_running_a_finished_run_again_changes_nothing(finished):

@@ -40,7 +40,7 @@ def content(directory: Path) -> tuple[int, int, str]:
     nothing: Any = ()
     whole = state(0)
     like = {"agent": whole.train, "loop": whole._replace(train=nothing)}
-    found, items, _ = checkpoint.restore(directory, like)
+    found, items, *_ = checkpoint.restore(directory, like)
     digest = checkpoint.digest(found, "agent") + checkpoint.digest(found, "loop")
     return found.step, int(items["agent"]["kernel"][0, 0]), digest
 

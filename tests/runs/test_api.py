@@ -14,7 +14,7 @@ import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import envs
 from ne_dreamer_jax.envs import base, registry
 from ne_dreamer_jax.envs.config import GIVEN, DmcConfig, OwnConfig, RoomsConfig, with_images
-from ne_dreamer_jax.envs.vector import as_vector
+from ne_dreamer_jax.envs.vector import as_vector, vectorize
 from ne_dreamer_jax.runs.run_directory import RefusedError
 from tests.experiments import toy
 
@@ -147,7 +147,7 @@ def test_an_environment_that_never_ends_is_evaluated_up_to_the_bound(tmp_path):
     assert any("had not ended after 100 steps" in line for line in said)
     result = nedreamer.evaluate(tmp_path / "run", env=endless(), episodes=2, echo=quiet)
     assert result["policy"]["unfinished"] == 2
-    assert all(100 <= length < 200 for length in result["policy"]["lengths"])
+    assert result["policy"]["lengths"] == [100, 100]
 
 
 @pytest.mark.slow
@@ -163,8 +163,6 @@ def test_without_evaluations_there_are_none(tmp_path):
 def test_play_keeps_what_was_seen_and_done(given):
     path, _ = given
     loaded = nedreamer.load(path, env=toy.env())
-    from ne_dreamer_jax.envs.vector import vectorize
-
     play = nedreamer.loop.make_play(vectorize(loaded.env), loaded.agent, max_steps=50, chunk_steps=4)
     played = play(loaded.state.params, jax.random.key(0), 3, steps=True)
     steps = played.steps
@@ -172,6 +170,17 @@ def test_play_keeps_what_was_seen_and_done(given):
     assert not steps.counts[toy.LENGTH + 1 :].any()
     np.testing.assert_allclose((steps.reward * steps.counts).sum(0), played.returns, rtol=1e-6)
     assert steps.latent.deter.shape[:2] == steps.action.shape[:2] == steps.counts.shape
+
+
+@pytest.mark.parametrize("bound", [3, 4, toy.LENGTH])
+def test_episodes_are_played_up_to_the_bound_and_no_further(given, bound):
+    loaded = nedreamer.load(given[0], env=toy.env())
+    make = lambda bound: nedreamer.loop.make_play(vectorize(loaded.env), loaded.agent, max_steps=bound, chunk_steps=4)
+    played = make(bound)(loaded.state.params, jax.random.key(0), 2, steps=True)
+    whole = make(50)(loaded.state.params, jax.random.key(0), 2, steps=True)
+    assert np.asarray(played.lengths).tolist() == [bound] * 2
+    assert played.unfinished == (2 if bound < toy.LENGTH else 0)
+    np.testing.assert_allclose(whole.steps.reward[: bound + 1].sum(0), played.returns, rtol=1e-5)
 
 
 def test_images_that_the_agent_does_not_see_change_nothing_and_are_kept(given):
