@@ -9,6 +9,7 @@ import pytest
 
 from ne_dreamer_jax import loop, make_agent, replay
 from ne_dreamer_jax.replay import Episode, ring
+from ne_dreamer_jax.system import memory
 from tests import tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -43,6 +44,23 @@ def test_steps_are_held_in_the_time_convention():
         assert bool(data.is_terminal[begin + length, 0]) == made.is_terminal
         begin += length + 1
     assert begin == data.reward.shape[0]
+
+
+def test_data_that_fits_memory_once_is_held_once(monkeypatch):
+    episodes = [episode(40, seed=s) for s in range(3)]
+    made = replay.from_episodes(episodes, SPEC, SIZES)
+    size = sum(x.nbytes for x in jax.tree.leaves(made.data))
+    allocated = []
+    zeros = jnp.zeros
+    monkeypatch.setattr(
+        jnp, "zeros", lambda *args, **options: allocated.append(zeros(*args, **options)) or allocated[-1]
+    )
+    replay.from_episodes(episodes, SPEC, SIZES)
+    latents = sum(x.nbytes for x in jax.tree.leaves(made.data.latent))
+    assert sum(x.nbytes for x in allocated) <= latents + 64 < size / 2
+    monkeypatch.setattr(memory, "available", lambda: size // 2)
+    with pytest.raises(ValueError, match="free"):
+        replay.from_episodes(episodes, SPEC, SIZES)
 
 
 def test_every_sequence_of_the_data_is_sampled_and_none_that_wraps_around():

@@ -52,14 +52,12 @@ def from_episodes(
     if not rows:
         raise ValueError("expected at least one episode, got none")
     data = jax.tree.map(lambda *parts: np.concatenate(parts)[:, None], *rows)  # [C, 1, ...]
-    capacity = len(data.reward)
     deter, stoch, classes = latent_sizes
     latent = Latent(np.zeros((1, deter), np.float32), np.zeros((1, stoch, classes), np.float32))  # type: ignore[arg-type]
     example = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), data)._replace(
         latent=jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), latent)
     )
-    empty = ring.init(example, capacity, 1, latent_dtype)
-    return ring.filled(empty, jax.tree.map(jnp.asarray, data._replace(latent=empty.data.latent)))
+    return ring.full(example, data, latent_dtype)
 
 
 def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:

@@ -69,15 +69,19 @@ def init(
       ValueError: where the example is no transition of N environments, where the capacity is below two steps for each
         of them, or where memory can't hold it (see `check_capacity`).
     """
-    if num_envs < 1 or capacity < 2 * num_envs:
-        raise ValueError(f"expected a capacity of two steps or more for each of {num_envs} envs, got {capacity}")
-    if capacity >= 2**31:
-        raise ValueError(f"expected a capacity below 2**31 = {2**31:,} steps, got {capacity:,}")
+    _check_counts(capacity, num_envs)
     check_capacity(example, capacity, num_envs, deter_dtype, available)
     rows = capacity // num_envs
     data = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), _stored(example, num_envs, deter_dtype))
     position, size = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)  # two buffers: one can't be donated twice
     return Replay(data, position, size, example.latent.stoch.shape[-1])
+
+
+def _check_counts(capacity: int, num_envs: int) -> None:
+    if num_envs < 1 or capacity < 2 * num_envs:
+        raise ValueError(f"expected a capacity of two steps or more for each of {num_envs} envs, got {capacity}")
+    if capacity >= 2**31:
+        raise ValueError(f"expected a capacity below 2**31 = {2**31:,} steps, got {capacity:,}")
 
 
 @in_32_bits
@@ -98,10 +102,27 @@ def add(replay: Replay, transition: Transition) -> Replay:
     return replace(replay, data=data, position=(replay.position + 1) % rows, size=jnp.minimum(replay.size + 1, rows))
 
 
-def filled(replay: Replay, data: Transition) -> Replay:
-    """The ring full of ``data``, ``[C, N, ...]`` in its own shapes and dtypes, oldest row first."""
-    shapes.check(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), replay.data), data, "the replay")
-    return replace(replay, data=data, size=jnp.asarray(data.reward.shape[0], jnp.int32))
+def full(example: Transition, data: Transition, deter_dtype: Any = jnp.float32) -> Replay:
+    """A ring that is full of ``data``, which goes to the device once; its latents are zero.
+
+    Args:
+      example, deter_dtype: as for `init`.
+      data: ``[C, N, ...]``, oldest row first; the latents, which are not read, may be missing.
+
+    Raises:
+      ValueError: where there are fewer than two rows, or memory can't hold them, or the data does not fit the example.
+    """
+    rows, num_envs = data.reward.shape
+    _check_counts(rows * num_envs, num_envs)
+    check_capacity(example, rows * num_envs, num_envs, deter_dtype)
+    expected = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), _stored(example, num_envs, deter_dtype)
+    )
+    latent = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), expected.latent)
+    data = jax.tree.map(jnp.asarray, data._replace(latent=latent))
+    shapes.check(expected, data, "the replay")
+    position, size = jnp.zeros((), jnp.int32), jnp.asarray(rows, jnp.int32)
+    return Replay(data, position, size, example.latent.stoch.shape[-1])
 
 
 def next_row(replay: Replay) -> Array:

@@ -72,14 +72,27 @@ class Failing(Counting):
         return obs, *result[1:]
 
 
-def dies_at_reset() -> gymnasium.Env:
-    """An environment that never begins."""
+class SlowToBegin(Counting):
+    """Takes a second to begin an episode."""
 
-    class Env(Counting):
-        def reset(self, **_: Any) -> Any:
+    def reset(self, **options: Any) -> Any:
+        time.sleep(1.0)
+        return super().reset(**options)
+
+
+class BeginsOnce(Counting):
+    """Begins an episode where the file ``mark`` is not there yet, or never."""
+
+    def __init__(self, mark: str | None = None) -> None:
+        super().__init__()
+        self.mark = mark
+
+    def reset(self, **options: Any) -> Any:
+        if self.mark is None or os.path.exists(self.mark):
             raise RuntimeError("no level found")
-
-    return Env()
+        with open(self.mark, "w"):
+            pass
+        return super().reset(**options)
 
 
 class Walk(dm_env.Environment):

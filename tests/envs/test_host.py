@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -161,7 +162,10 @@ class Lab:
     """A stand-in for deepmind_lab's, with its interface."""
 
     def __init__(self, level: str, observations: list[str], config: dict[str, str], renderer: str) -> None:
-        assert (level, observations, renderer) == ("contributed/dmlab30/rooms_x", ["RGB_INTERLEAVED"], "software")
+        assert (observations, renderer) == (["RGB_INTERLEAVED"], "software")
+        assert level in ("contributed/dmlab30/rooms_x", "contributed/dmlab30/rooms_x_test")
+        if level.endswith("_test"):  # held out, as the real one says
+            assert config.get("allowHoldOutLevels") == "true"
         self.size, self.frames, self.seed = int(config["width"]), 0, None
 
     def reset(self, seed: int | None = None) -> None:
@@ -192,6 +196,19 @@ def test_dmlab_is_stepped_by_its_own_interface(monkeypatch):
     end = player.step(np.int32(8))
     assert (end.obs["image"].max(), end.is_last, end.is_terminal) == (8, True, False)
     assert player.reset(None)["image"].max() == 0
+    dmlab.LabPlayer("rooms_x_test", Options(image_size=16))
+
+
+def test_lists_of_observations_are_seen_by_their_places():
+    class Listing(host_fakes.Walk):
+        def observation_spec(self):
+            return list(super().observation_spec().values())
+
+        def _obs(self):
+            return list(super()._obs().values())
+
+    player = players.DmEnvPlayer(Listing(), Options())
+    assert {name: x.tolist() for name, x in player.reset(None).items()} == {"0": 0.0, "1": [1, 0, 0, 0]}
 
 
 # N environments.
@@ -210,6 +227,64 @@ def play(env: VectorEnv, steps: int, keys: jax.Array = KEYS, action: Any = None)
         state, timestep = step(state, action)
         timesteps.append(jax.device_get(timestep))
     return state, timesteps
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: from_gymnasium(host_fakes.BeginsOnce), "RuntimeError: no level found"),
+        (
+            lambda: from_gymnasium(lambda: gymnasium.make("CartPole-v1"), Options("pixels")),
+            "expected a picture",
+        ),
+        (lambda: from_dm_env(host_fakes.Walk, Options("pixels")), "without physics to draw"),
+    ],
+)
+def test_what_cant_begin_an_episode_is_refused_when_it_is_made(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"obs": "pictures"}, "expected obs to be own, pixels or both, got 'pictures'"),
+        ({"image_size": -3}, "expected an image_size of at least 1, or None, got -3"),
+        ({"action_repeat": 0}, "expected an action_repeat of at least 1, got 0"),
+        ({"workers": -1}, "expected at least 1 worker process, or None, got -1"),
+        ({"step_seconds": -1.0}, "expected step_seconds above 0, got -1.0"),
+        ({"on_failure": "stpo"}, "expected on_failure to be restart or stop, got 'stpo'"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make("gym:CartPole-v1", **options)
+
+
+def test_a_factory_that_holds_an_environment_is_refused():
+    lock = threading.Lock()
+    with pytest.raises(ValueError, match="expected a factory that makes the environment where it is called"):
+        from_gymnasium(lambda: (lock, host_fakes.Counting())[1])
+
+
+def test_environments_of_a_worker_have_a_steps_time_each():
+    env = from_gymnasium(host_fakes.SlowToBegin, workers=Workers(processes=1, step_seconds=1.5))
+    _, timesteps = play(env, 2, KEYS[:2])
+    assert env.host.lines() == []
+    assert not timesteps[0].is_last.any()
+    env.host.close()
+
+
+def test_an_environment_that_is_made_anew_begins_as_its_seed_says():
+    """Also after an error of its own, so that a run in which it fails repeats."""
+    starts = []
+    for _ in range(2):
+        env = from_gymnasium(functools.partial(host_fakes.Failing, "raises"), workers=Workers(processes=1))
+        _, timesteps = play(env, 9, KEYS[:1])
+        starts.append([float(t.obs["count"][0, 1]) for t in timesteps if t.is_first[0]])
+        env.host.close()
+    assert len(starts[0]) == len(set(starts[0])) > 1
+    assert starts[0] == starts[1]
 
 
 def column(timesteps: list[TimeStep], name: str, env: int) -> list[Any]:
@@ -436,8 +511,8 @@ def test_an_environment_that_always_fails_is_given_up():
     assert len(env.host.lines()) == 5
 
 
-def test_an_environment_that_never_begins_is_given_up():
-    env = made(from_gymnasium(host_fakes.dies_at_reset))
+def test_an_environment_that_never_begins_again_is_given_up(tmp_path):
+    env = made(from_gymnasium(functools.partial(host_fakes.BeginsOnce, str(tmp_path / "mark"))))
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.block_until_ready(play(env, 1, KEYS[:1]))
     assert "no level found" in env.host.failure

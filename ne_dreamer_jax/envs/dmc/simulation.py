@@ -9,6 +9,7 @@ import importlib.util
 import io
 import math
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -113,6 +114,10 @@ takes all its 50 turns whenever environments are stepped together, though few ar
 """
 
 
+_TRACING = threading.RLock()
+"""One thread at a time traces with these: of two, the first to end would put the other's back."""
+
+
 @contextlib.contextmanager
 def _mjx_numerics() -> Iterator[None]:
     """What MJX is traced under, whatever the caller's configuration.
@@ -121,15 +126,16 @@ def _mjx_numerics() -> Iterator[None]:
     default, would take its trajectories away from MuJoCo's.
     """
     promotion = (jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"))
-    theirs = [getattr(module, name) for module, name, _ in _INSTEAD]
-    for module, name, ours in _INSTEAD:
-        setattr(module, name, ours)
-    try:
-        with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
-            yield
-    finally:
-        for (module, name, _), their in zip(_INSTEAD, theirs, strict=True):
-            setattr(module, name, their)
+    with _TRACING:
+        theirs = [getattr(module, name) for module, name, _ in _INSTEAD]
+        for module, name, ours in _INSTEAD:
+            setattr(module, name, ours)
+        try:
+            with promotion[0], promotion[1], jax.default_matmul_precision("highest"):
+                yield
+        finally:
+            for (module, name, _), their in zip(_INSTEAD, theirs, strict=True):
+                setattr(module, name, their)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -45,6 +45,8 @@ class LabPlayer:
 
         size = options.image_size or 64
         settings = {"width": str(size), "height": str(size), "fps": str(_FRAMES_PER_SECOND)}
+        if level.endswith("_test"):
+            settings["allowHoldOutLevels"] = "true"  # without which such levels do not load
         self._lab: Any = deepmind_lab.Lab(
             level if "/" in level else LEVELS + level, [_FRAME], config=settings, renderer="software"
         )

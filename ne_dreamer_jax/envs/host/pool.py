@@ -19,7 +19,7 @@ import numpy as np
 
 from ne_dreamer_jax.envs.host.players import Player, Seen
 from ne_dreamer_jax.envs.host.spaces import Described
-from ne_dreamer_jax.envs.host.worker import BEGIN, NOTHING, STEP, Failed, Make, Seed, Step
+from ne_dreamer_jax.envs.host.worker import BEGIN, NOTHING, STEP, Failed, Make, Seed, Step, another_seed
 from ne_dreamer_jax.system import processors
 
 START_SECONDS = 600.0
@@ -46,7 +46,8 @@ class Workers(NamedTuple):
     processes: int | None = None
     """At most one an environment; None: as many as this process has processors."""
     step_seconds: float = 60.0
-    """What a step or the beginning of an episode may take before its worker counts as hung."""
+    """What a step or the beginning of an episode may take. A worker whose environments, one after another, have taken
+    more than that each counts as hung."""
     on_failure: Literal["restart", "stop"] = "restart"
     """Whether training goes on with a new worker or environment, or is saved and stopped."""
 
@@ -57,15 +58,18 @@ class Lost(NamedTuple):
     why: str
 
 
+class Kind(NamedTuple):
+    """Environments of one kind."""
+
+    factory: bytes  # of players, as cloudpickle stores it
+    draws: bool  # whether pictures of them are drawn
+
+
 class Worker:
     """One process with some environments."""
 
-    def __init__(self, factory: bytes, count: int, number: int) -> None:
-        """Starts it, and asks for its environments; `described` waits for them.
-
-        Args:
-          factory: of players, as cloudpickle stores it.
-        """
+    def __init__(self, kind: Kind, count: int, number: int, tries: bool) -> None:
+        """Starts it, and asks for its environments, of which the first ``tries`` to begin an episode."""
         self.number, self.count = number, count
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-c", _MAIN, str(theirs.fileno())]
@@ -83,7 +87,7 @@ class Worker:
         )
         theirs.close()
         self.connection = Connection(ours.detach())
-        self.send(Make(_Pickled(factory), count))
+        self.send(Make(_Pickled(kind.factory), count, kind.draws, tries))
 
     def send(self, message: Any) -> None:
         """Sends, or leaves it to `receive` to find that nobody is there."""
@@ -131,17 +135,19 @@ class _Pickled:
 class Pool:
     """N environments in worker processes, stepped together."""
 
-    def __init__(self, factory: bytes, n: int, workers: Workers, report: Callable[[str], None]) -> None:
+    def __init__(
+        self, kind: Kind, n: int, workers: Workers, report: Callable[[str], None], tries: bool = False
+    ) -> None:
         """Starts the workers.
 
         Args:
-          factory: of players, as cloudpickle stores it.
           report: takes a line on each failure.
+          tries: whether an environment has to begin an episode first.
 
         Raises:
           HostEnvError: an environment can't be made.
         """
-        self.n, self._factory, self._options, self._report = n, factory, workers, report
+        self.n, self._kind, self._options, self._report = n, kind, workers, report
         count = min(n, workers.processes or processors.available())
         bounds = np.linspace(0, n, count + 1).astype(int)
         self._shares = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
@@ -154,7 +160,7 @@ class Pool:
         self.started: int | None = None
         """The number of the step that workers were last asked for."""
         self._asked = False  # whether they have not been heard since
-        self._workers = [self._start(i) for i in range(count)]
+        self._workers = [self._start(i, tries) for i in range(count)]
         for i in range(count):
             self.described = self._ready(i, attempts=1)
 
@@ -163,7 +169,7 @@ class Pool:
         self._seeds = np.array([seed % 2**63 for seed in seeds], np.uint64)
         self._restarts[:] = 0
         for worker, share in zip(self._workers, self._shares, strict=True):
-            worker.send(Seed([_seed(seed, 0) for seed in self._seeds[share]]))
+            worker.send(Seed([another_seed(int(seed), 0) for seed in self._seeds[share]]))
 
     def start(self, number: int, actions: np.ndarray, restart: np.ndarray) -> None:
         """Asks for step ``number``, if that has not been done; environments to ``restart`` begin an episode instead."""
@@ -189,11 +195,12 @@ class Pool:
                 "expected the state that the last step returned: environments in worker processes can't be stepped "
                 "twice from one"
             )
-        deadline = time.monotonic() + self._options.step_seconds
+        asked = time.monotonic()
         answers: list[Any] = []
         gone: list[int] = []
         for i, share in enumerate(self._shares):
-            answer = self._workers[i].receive(self._options.step_seconds, deadline)
+            seconds = self._options.step_seconds * (share.stop - share.start)
+            answer = self._workers[i].receive(seconds, asked + seconds)
             if isinstance(answer, Lost):
                 gone.append(i)
                 self._report(f"{answer.why}; it is started anew, and its episodes are cut.")
@@ -221,9 +228,9 @@ class Pool:
         for worker in workers:
             worker.close()
 
-    def _start(self, number: int) -> Worker:
+    def _start(self, number: int, tries: bool = False) -> Worker:
         share = self._shares[number]
-        return Worker(self._factory, share.stop - share.start, number)
+        return Worker(self._kind, share.stop - share.start, number, tries)
 
     def _ready(self, i: int, attempts: int) -> Described:
         """Waits until a worker has made its environments, and starts it anew where it can't.
@@ -253,7 +260,7 @@ class Pool:
             self._restarts[share] += 1
             self._gone[share] = True
             numbers = zip(self._seeds[share], self._restarts[share], strict=True)
-            self._workers[i].send(Seed([_seed(seed, number) for seed, number in numbers]))
+            self._workers[i].send(Seed([another_seed(int(seed), int(number)) for seed, number in numbers]))
 
     def _counted(self, i: int, answer: Seen | Failed | Lost | None, first: bool) -> Seen | Lost:
         """Reports and counts what an environment failed at, on the ``first`` step of an episode or later."""
@@ -306,14 +313,16 @@ class Pools:
     that was stored by another process is recognised as such.
     """
 
-    def __init__(self, factory: Callable[[], Player], workers: Workers | None = None) -> None:
-        """Starts one worker, to see what the environments are like.
+    def __init__(self, factory: Callable[[], Player], workers: Workers | None = None, draws: bool = False) -> None:
+        """Starts one worker, to see what the environments are like, and whether they can begin an episode.
 
         Args:
           factory: makes one; pickled by value where it stands in a script or notebook.
+          draws: whether pictures of them are drawn.
 
         Raises:
-          HostEnvError: the environment can't be made, or an agent can't see it or act in it; the message says why.
+          HostEnvError: the environment can't be made or begun, or an agent can't see it or act in it; the message says
+            why.
         """
         self.workers = workers or Workers()
         self._lock = threading.RLock()
@@ -326,13 +335,19 @@ class Pools:
                 "environments in worker processes need the package cloudpickle; install it with: pip install "
                 "'ne-dreamer-jax[host]'"
             ) from error
-        self._factory = cloudpickle.dumps(factory)
+        try:
+            self._kind = Kind(cloudpickle.dumps(factory), draws)
+        except Exception as error:  # whatever an object's own pickling raises
+            raise HostEnvError(
+                f"expected a factory that makes the environment where it is called, in a worker process, got one that "
+                f"holds what can't be sent there: {type(error).__name__}: {error}"
+            ) from error
         self._lines: list[str] = []
         self.failure: str | None = None
         """Why environments were given up, where they were."""
         self.should_stop = False
         """Whether something failed and that is to end the run."""
-        self._looked_at = self._make(1)
+        self._looked_at = self._make(1, tries=True)
         self.described = self._looked_at.described
         self._idle.append(self._looked_at)
 
@@ -405,13 +420,8 @@ class Pools:
         for pool in pools:
             pool.close()
 
-    def _make(self, n: int) -> Pool:
-        return Pool(self._factory, n, self.workers, self.failed)
-
-
-def _seed(seed: Any, restarts: Any) -> int:
-    """Of an environment in a worker that was started for the so-manieth time: 31 bits, as libraries take them."""
-    return int(np.random.SeedSequence([int(seed), int(restarts)]).generate_state(1)[0] >> 1)
+    def _make(self, n: int, tries: bool = False) -> Pool:
+        return Pool(self._kind, n, self.workers, self.failed, tries)
 
 
 def _ended(code: int | None) -> str:

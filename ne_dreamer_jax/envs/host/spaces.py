@@ -42,7 +42,7 @@ def leaves(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
     """An observation's parts by the names that `leaves` gives them."""
-    if isinstance(value, Mapping | tuple):
+    if isinstance(value, Mapping | tuple | list):
         entries = value.items() if isinstance(value, Mapping) else enumerate(value)
         return {k: v for key, part in entries for k, v in flat(part, f"{name}/{key}" if name else str(key)).items()}
     return {name: value}

@@ -25,14 +25,36 @@ def from_gymnasium(
     Raises:
       ValueError: it can't be made, or an agent can't see it or act in it; the message says why.
     """
-    return host_env(Made(GymnasiumPlayer, factory, options or Options()), workers)
+    return _made(GymnasiumPlayer, factory, options, workers)
 
 
 def from_dm_env(
     factory: Callable[[], Any], options: Options | None = None, workers: Workers | None = None
 ) -> VectorEnv:
     """N environments of a ``dm_env.Environment``; arguments and errors as of `from_gymnasium`."""
-    return host_env(Made(DmEnvPlayer, factory, options or Options()), workers)
+    return _made(DmEnvPlayer, factory, options, workers)
+
+
+def _made(player: Any, factory: Callable[[], Any], options: Options | None, workers: Workers | None) -> VectorEnv:
+    options, workers = options or Options(), workers or Workers()
+    check(options, workers)
+    return host_env(Made(player, factory, options), workers, draws=options.observe != "own")
+
+
+def check(options: Options, workers: Workers) -> None:
+    """Raises ValueError for values that make no sense."""
+    size, processes = options.image_size, workers.processes
+    expected = {
+        "obs to be own, pixels or both": (options.observe, options.observe in ("own", "pixels", "both")),
+        "an image_size of at least 1, or None": (size, size is None or size >= 1),
+        "an action_repeat of at least 1": (options.action_repeat, options.action_repeat >= 1),
+        "at least 1 worker process, or None": (processes, processes is None or processes >= 1),
+        "step_seconds above 0": (workers.step_seconds, workers.step_seconds > 0),
+        "on_failure to be restart or stop": (workers.on_failure, workers.on_failure in ("restart", "stop")),
+    }
+    for what, (got, fits) in expected.items():
+        if not fits:
+            raise ValueError(f"expected {what}, got {got!r}")
 
 
 def make(
@@ -59,12 +81,9 @@ def make(
     """
     names.check(name)
     own: Any = "own" if obs == "vector" and name.startswith(names.DM_CONTROL) else obs
-    if own not in ("own", "pixels", "both"):
-        raise ValueError(f"expected obs to be own, pixels or both, got {obs!r}")
-    options = Options(own, image_size, action_repeat)
+    options, spread = Options(own, image_size, action_repeat), Workers(workers, step_seconds, on_failure)
+    check(options, spread)
     for prefix, player in PLAYERS.items():
         if name.startswith(prefix):
-            return host_env(
-                partial(player, name.removeprefix(prefix), options), Workers(workers, step_seconds, on_failure)
-            )
+            return host_env(partial(player, name.removeprefix(prefix), options), spread, draws=own != "own")
     raise AssertionError(name)

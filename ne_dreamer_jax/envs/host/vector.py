@@ -42,18 +42,21 @@ class _Answer(NamedTuple):
     fault: Any  # bool [N], a number was not finite, and the episode ends here
 
 
-def host_env(factory: Callable[[], Player], workers: Workers | None = None) -> VectorEnv:
+def host_env(factory: Callable[[], Player], workers: Workers | None = None, draws: bool = False) -> VectorEnv:
     """N environments of one kind in worker processes.
 
     An episode whose worker dies or hangs, or whose environment raises, ends with the last observation over again
     (``is_last``, not ``is_terminal``, reward 0) and is counted; so do those of a training run that goes on in another
     process. ``VectorEnv.host`` has what can be asked of the workers.
 
+    Args:
+      draws: whether pictures of the environments are drawn.
+
     Raises:
-      ValueError: the environment can't be made, or an agent can't see it or act in it.
+      ValueError: the environment can't be made or begin an episode, or an agent can't see it or act in it.
     """
     try:
-        pools = Pools(factory, workers)
+        pools = Pools(factory, workers, draws)
     except HostEnvError as error:
         raise ValueError(str(error)) from error
     described = pools.described

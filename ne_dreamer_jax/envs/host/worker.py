@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ne_dreamer_jax.envs.host import opengl
 from ne_dreamer_jax.envs.host.players import Player, Seen
 
 STEP, BEGIN, NOTHING = 0, 1, 2
@@ -30,6 +31,8 @@ class Make(NamedTuple):
 
     factory: Callable[[], Player]
     number: int
+    draws: bool  # whether pictures of them are drawn
+    tries: bool  # whether the first begins an episode, to see whether it can
 
 
 class Seed(NamedTuple):
@@ -58,20 +61,26 @@ class Envs:
         self._factory = factory
         self._players: list[Player | None] = [factory() for _ in range(count)]
         self._seeds: list[int | None] = [None] * count
+        self._begun: list[int | None] = [None] * count  # the seeds of the last beginnings that had one
+        self._remade = [0] * count
 
-    @property
-    def described(self) -> Any:
-        """What the first is like."""
+    def describe(self, tries: bool) -> Any:
+        """What the first is like; if it ``tries``, it has to begin an episode first."""
         player = self._players[0]
         assert player is not None
+        if tries:
+            player.reset(None)
         return player.described
 
     def seed(self, seeds: list[int]) -> None:
         """Seeds the next beginnings."""
-        self._seeds = list(seeds)
+        self._seeds, self._remade = list(seeds), [0] * len(seeds)
 
     def step(self, number: int, action: np.ndarray, what: int) -> Seen | Failed | None:
-        """A step of one environment; what it raises is told, and the environment made anew at its next beginning."""
+        """A step of one environment; what it raises is told, and the environment made anew at its next beginning.
+
+        One that is made anew has a seed that follows from its last one, so that the run repeats.
+        """
         if what == NOTHING:
             return None
         try:
@@ -80,10 +89,15 @@ class Envs:
                 player = self._players[number] = self._factory()
             if what == BEGIN:
                 seed, self._seeds[number] = self._seeds[number], None
+                self._begun[number] = self._begun[number] if seed is None else seed
                 return checked(Seen(player.reset(seed), 0.0, False, False))
             return checked(player.step(action))
         except Exception as error:
             self._drop(number)
+            self._remade[number] += 1
+            before = self._begun[number]
+            if self._seeds[number] is None and before is not None:
+                self._seeds[number] = another_seed(before, self._remade[number])
             return Failed(summary(error))
 
     def close(self) -> None:
@@ -96,6 +110,11 @@ class Envs:
         if player is not None:
             with contextlib.suppress(Exception):  # it is broken already, or nobody is left to hear of it
                 player.close()
+
+
+def another_seed(seed: int, number: int) -> int:
+    """Of an environment that begins for the so-manieth time: 31 bits, as libraries take them."""
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0] >> 1)
 
 
 def checked(stepped: Seen) -> Seen:
@@ -129,8 +148,10 @@ def serve(connection: Connection) -> None:
         answer: Any = None
         if isinstance(message, Make):
             try:
+                if message.draws:
+                    opengl.allow()  # before the factory loads MuJoCo
                 envs = Envs(message.factory, message.number)
-                answer = envs.described
+                answer = envs.describe(message.tries)
             except Exception as error:
                 answer = Failed(summary(error) if not isinstance(error, ValueError) else str(error))
         elif envs is None:
@@ -149,7 +170,7 @@ def serve(connection: Connection) -> None:
 
 
 def end_with(parent: int, seconds: float = 1.0) -> None:
-    """Ends this process when its parent is gone, also while an environment hangs."""
+    """Ends this process when its parent is gone, also while an environment hangs that lets other threads run."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -2,8 +2,9 @@
 
 Movement, pick-up volumes, rewards, doors, timers, layouts and randomness are DMLab's, number by number; `movement` and
 a file a task hold them, `draw` the first-person view. What is drawn otherwise than in DMLab: patterns and outlines in
-the place of its textures and models, objects that turn to the player and do not spin or bob, even light, and no
-head-up display. JAX loads when one of these is first touched; `names` loads nothing.
+the place of its textures and models, objects that turn to the player, do not spin or bob and lie nearer to the floor
+(those of the nonmatching task half as large again, and without the platforms they lie on), even light, and no head-up
+display. JAX loads when one of these is first touched; `names` loads nothing.
 """
 
 import lazy_loader
