@@ -13,7 +13,7 @@ from dm_control import suite
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax.envs import config as env_configs
 from ne_dreamer_jax.envs.config import DmcConfig, DmControlConfig
-from ne_dreamer_jax.envs.host import factories, opengl, players, pool
+from ne_dreamer_jax.envs.host import factories, opengl, players, worker
 
 KEYS = jax.random.split(jax.random.key(1), 2)
 
@@ -29,9 +29,9 @@ def test_observations_and_rewards_are_dm_controls_own():
     assert not any(t.is_terminal.any() for t in timesteps)
     assert timesteps[501].is_first.all()
 
-    for i, seed in enumerate(state.seeds):  # the same episodes by hand
-        theirs = suite.load("pendulum", "swingup", task_kwargs={"random": pool._seed(seed, 0)})
-        theirs.task.random.seed(pool._seed(seed, 0))
+    for i, seed in enumerate(np.asarray(state.seeds).tolist()):  # the same episodes by hand
+        theirs = suite.load("pendulum", "swingup", task_kwargs={"random": worker.another_seed(seed, 0)})
+        theirs.task.random.seed(worker.another_seed(seed, 0))
         timestep, total = theirs.reset(), 0.0
         for ours in timesteps[:501]:
             np.testing.assert_allclose(ours.obs["orientation"][i], timestep.observation["orientation"], rtol=1e-5)
