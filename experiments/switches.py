@@ -9,6 +9,7 @@ agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import time
@@ -78,26 +79,29 @@ def main(
             for task in tasks or (None,)
             for variant in variants
         }
-        lines = _read(out)
-    compared = [_results(out, lines, config, variant, seeds) for (_, variant), config in made.items()]
+        _read(out)  # what is no such file is refused before anything trains
+    compared = [_results(out, config, variant, seeds) for (_, variant), config in made.items()]
     say("")
     for row in table(compared):
         say(row)
 
 
-def _results(out: Path, lines: list[dict[str, Any]], config: Config, variant: str, seeds: int) -> dict[str, Any]:
-    """A variant's line with so many seeds; those that the file's ``lines`` lack are trained, and kept one by one."""
-    same = [line for line in lines if line["config"] == plain(config) and line["variant"] == variant]
-    found = max(same, key=lambda line: line["seeds"], default=None)
+def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, Any]:
+    """A variant's line with so many seeds; those that the file lacks are trained, and kept one by one.
+
+    Raises ValueError as `_read`.
+    """
+    is_same = lambda line: line["config"] == plain(config) and line["variant"] == variant
+    found = max(filter(is_same, _read(out)), key=lambda line: line["seeds"], default=None)
     done = 0 if found is None else found["seeds"]
     if done < seeds:
         say(f"{config.env.task}, {variant}: {seeds} seeds")
-        others = [line for line in lines if line not in same]
         for line in train(config, variant, range(done, seeds), found):
             say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
-            lines[:], found = [*others, line], line
+            found = line
             out.parent.mkdir(parents=True, exist_ok=True)
-            write_text(out, "".join(json.dumps(each) + "\n" for each in lines))
+            others = itertools.filterfalse(is_same, _read(out))  # another command may have added to them
+            write_text(out, "".join(json.dumps(each) + "\n" for each in [*others, line]))
     assert found is not None
     return found | {"seeds": seeds, "curves": found["curves"][:seeds]}
 
