@@ -123,11 +123,15 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
       SystemExit: a run was stopped by a signal, and so is this process.
       RefusedError, ValueError: as `finished`.
     """
+    place = lambda method, seed: directory / method.replace("/", "-") / f"seed{seed}"
+    # All of them before the first one trains: a run of other settings is no part of this comparison.
+    runs = [(method, seed) for seed in range(seeds) for method in methods]
+    done = {run for run in runs if finished(place(*run), asked, *run)}
     failed: dict[tuple[str, int], int] = {}
     for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
         for method in methods:
-            path = directory / method.replace("/", "-") / f"seed{seed}"
-            if failed.get((method, 0)) == REFUSED or finished(path, asked, method, seed):
+            path = place(method, seed)
+            if failed.get((method, 0)) == REFUSED or (method, seed) in done:
                 continue
             say(f"\n{method}, seed {seed}: {path}")
             code = train(path, asked.options(method, seed))

@@ -70,6 +70,8 @@ def main(
     quiet()
     from experiments.train import configure
 
+    if len(set(variants)) < len(variants):
+        raise click.UsageError(f"expected variants that differ, got one twice: {' '.join(variants)}")
     common = (*(SMALL if small else ()), *assignments)
     with refusing(ValueError):
         made = {
@@ -127,6 +129,7 @@ def train(
     env = env_configs.make(config.env)
     agent = nedreamer.make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, config.env.action_repeat)
+    say("  Compiling, which takes a minute or more; then a line for each seed.")
     repeat = config.env.action_repeat * config.loop.num_envs
     interval = max(1, (config.loop.eval_every or config.loop.env_steps) // repeat)
     ends = [*range(interval, loop.budget.vector_steps, interval), loop.budget.vector_steps]

@@ -127,6 +127,7 @@ def test_skipped_updates_are_counted_and_not_in_the_means():
             {"obs": {"image": np.zeros((6, 8, 8, 3), np.uint8), "vector": np.zeros((7, 3))}},
             r"obs\['image'\]: expected uint8\[7, 8, 8, 3\], got uint8\[6, 8, 8, 3\]",
         ),
+        ({"is_terminal": np.zeros(6, bool)}, r"episode 1, is_terminal: expected one bool for the whole episode"),
         ({"reward": np.full(6, np.nan)}, r"episode 1, reward: expected finite numbers, got nan"),
     ],
 )
@@ -136,8 +137,13 @@ def test_what_does_not_fit_is_refused_with_its_place(changes, message):
 
 
 def test_too_little_data_is_refused():
-    with pytest.raises(ValueError, match="at least one episode, got none"):
-        replay.from_episodes([], SPEC, SIZES)
+    for wrong, message in (
+        ([], "at least one episode, got none"),
+        (episode(), "put it into a list"),
+        ([{}], "got dict"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replay.from_episodes(wrong, SPEC, SIZES)
     agent = make_agent(tiny.CONFIG, SPEC)
     held = replay.from_episodes([episode(3)], SPEC, SIZES)
     shapes = jax.eval_shape(agent.init, jax.random.key(0))

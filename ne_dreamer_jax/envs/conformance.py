@@ -293,9 +293,13 @@ def _played(
         timesteps.append(timestep)
     cuts = env.cuts(state)
     failed = np.asarray(cuts.faults)
-    why = "".join(f"; {line}" for line in env.host.lines()[:3]) if env.host is not None else ""
+    lines = env.host.lines()[:3] if env.host is not None else []
     report.expect(
-        not failed.any(), "episodes", "error", "none that the environment cut", f"{failed.sum()} of them{why}"
+        not failed.any() and not lines,
+        "episodes",
+        "error",
+        "none that the environment cut or could not begin",
+        "; ".join([f"{failed.sum()} that were cut", *lines]),
     )
     if env.release is not None:
         env.release(state)

@@ -38,8 +38,8 @@ def train_offline(
       ValueError: replay holds too few steps for a sequence, or no update is asked for.
     """
     length = agent.config.batch_length
-    if updates < 1:
-        raise ValueError(f"updates: expected at least 1, got {updates}")
+    if updates < 1 or updates != int(updates):
+        raise ValueError(f"updates: expected a whole number of at least 1, got {updates}")
     if not bool(ring.can_sample(replay, length)):
         raise ValueError(
             f"replay: expected more than agent.batch_length {length} steps, got {int(replay.size)}; take shorter "

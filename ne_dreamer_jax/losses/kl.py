@@ -20,8 +20,13 @@ def unimix_logits(logits: jax.Array, mix: float = 0.01) -> jax.Array:
     Returns:
       float32 ``[..., K]``.
 
+    Raises:
+      ValueError: where ``mix`` is no share.
+
     Source: DreamerV3, "unimix".
     """
+    if not 0.0 <= mix <= 1.0:
+        raise ValueError(f"expected a mix from 0 to 1, got {mix}")
     logits = logits.astype(jnp.float32)
     if mix == 0.0:
         return jax.nn.log_softmax(logits)

@@ -48,6 +48,8 @@ def from_episodes(
       ValueError: a field does not fit the specification (which episode and field, expected and got), there are fewer
         than two steps, or memory can't hold them.
     """
+    if isinstance(episodes, Episode):
+        raise ValueError("expected an iterable of episodes, got one; put it into a list")
     rows = [_rows(number, episode, spec) for number, episode in enumerate(episodes)]
     if not rows:
         raise ValueError("expected at least one episode, got none")
@@ -62,6 +64,13 @@ def from_episodes(
 
 def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:
     """An episode's L + 1 steps, [L + 1, ...], without latents."""
+    if not isinstance(episode, Episode):
+        raise ValueError(f"episode {number}: expected replay.Episode, got {type(episode).__name__}")
+    if np.shape(episode.is_terminal) != ():
+        raise ValueError(
+            f"episode {number}, is_terminal: expected one bool for the whole episode, got the shape "
+            f"{list(np.shape(episode.is_terminal))}"
+        )
     reward = np.asarray(episode.reward)
     length = len(reward) if reward.ndim == 1 else -1
     _expect(number, "reward", reward, (length if length > 0 else "L",), np.float32)

@@ -115,6 +115,7 @@ def _play(
     """The episodes' steps, what the environment shows, and the summary of what the policy got."""
     with evaluation.opened(loaded.env) as env:
         play = make_play(env, loaded.agent, loaded.config.loop.eval_max_steps, mode=actions)
+        echo(f"Compiling, and playing {episodes} episodes.")
         played = play(loaded.state.params, key, episodes, steps=True)
         for line in env.host.lines() if env.host is not None else ():
             echo(line)

@@ -138,6 +138,7 @@ def _evaluate(
 ) -> dict[str, Any]:
     content = head(loaded, episodes, seed, echo)
     play = make_play(venv, loaded.agent, loaded.config.loop.eval_max_steps)
+    echo(f"Compiling, and playing {episodes} episodes with the policy, then {episodes} at random.")
     files = RunDirectory(path)
     for name, key in keys(seed).items():
         evaluation = play(loaded.state.params, key, episodes, random=name == "random", frames=with_video)

@@ -17,8 +17,8 @@ from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.system import memory
 
 NOTHING_LEARNED = (
-    "Nothing is learned in this run: it has no update. Raise loop.env_steps (--env-steps), or lower loop.prefill, the "
-    "number of agent steps before the first update."
+    "Nothing is learned in this run: it has no update. Raise loop.env_steps (--env-steps) or "
+    "loop.replay_ratio, or lower loop.prefill, the number of agent steps before the first update."
 )
 
 

@@ -310,6 +310,8 @@ def _start(
         return state, _lines(files, -1) if is_main_process else []
     except ValueError as error:
         raise run_directory.RefusedError(str(error)) from error
+    except checkpoint.DamagedError as error:
+        raise checkpoint.DamagedError(f"{error}{_agent_left(files, shapes.train)}") from error
     for reason in restored.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     env_step = restored.checkpoint.step
@@ -321,6 +323,15 @@ def _start(
         run.loop.frames.load(restored.items["frames"])
     state = restored.items["loop"]._replace(train=restored.items["agent"])
     return parallel.move(state, run.shapes), _lines(files, env_step) if is_main_process else []
+
+
+def _agent_left(files: RunDirectory, like: Any) -> str:
+    """What can still be done with a run that can't go on: a sentence, or nothing."""
+    try:
+        found = checkpoint.restore(files.checkpoints, {"agent": like}).checkpoint
+    except (checkpoint.DamagedError, FileNotFoundError, ValueError):
+        return ""
+    return f" The agent of {found.path} is intact: --fork {typed(files.path)} begins a new run with it"
 
 
 def _take_out(restored: checkpoint.Restored) -> None:

@@ -238,6 +238,8 @@ def play(env: VectorEnv, steps: int, keys: jax.Array = KEYS, action: Any = None)
             "expected a picture",
         ),
         (lambda: from_dm_env(host_fakes.Walk, Options("pixels")), "without physics to draw"),
+        (lambda: from_gymnasium(lambda: None), "expected a gymnasium.Env of the factory, got None"),
+        (lambda: from_dm_env(host_fakes.Counting), "expected a dm_env.Environment of the factory"),
     ],
 )
 def test_what_cant_begin_an_episode_is_refused_when_it_is_made(make, message):

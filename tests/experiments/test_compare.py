@@ -89,6 +89,13 @@ def test_a_finished_run_of_other_settings_is_refused_with_what_differs(tmp_path,
     assert len(started) == 1
 
 
+def test_no_run_begins_where_another_is_of_other_settings(tmp_path, invoke):
+    write(tmp_path / "r2dreamer" / "seed1", ["--preset", "quickstart", "--method", "r2dreamer", "--seed", "1"])
+    chosen = ["--method", "r2dreamer", "--seeds", 2, "--task", "dmc/cheetah_run"]
+    code, _, started = invoke(compare, tmp_path, *chosen)
+    assert (code, started) == (2, [])
+
+
 def test_a_finished_run_that_is_to_have_more_steps_goes_on(tmp_path, invoke):
     invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
     asked = compare.Asked("quickstart", None, None, [f"loop.env_steps={2 * BUDGET}"])

@@ -107,6 +107,7 @@ def test_an_interval_holds_the_difference_that_there_is():
         (["agent.behavior.lamda=0.9"], "lam"),
         ([VARIANTS[0], "--task", "dmc/cartpole_swingpu"], "cartpole_swingup"),
         ([], "Missing argument"),
+        ([VARIANTS[0], VARIANTS[0]], "expected variants that differ"),
     ],
 )
 def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, message):

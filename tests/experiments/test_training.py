@@ -174,6 +174,16 @@ def test_a_step_whose_checkpoint_is_damaged_is_saved_again(finished, tmp_path, i
     assert measured(tmp_path) == measured(finished[0])
 
 
+def test_where_no_whole_checkpoint_is_left_the_best_agent_is_named(tmp_path):
+    train(tmp_path, terminate, "env step 80")
+    found = {entry.step: entry for entry in checkpoint.checkpoints(tmp_path / "checkpoints")}
+    assert set(found) == {48, 80}
+    damage(found[80], "loop")
+    damage(found[80], "agent")
+    with pytest.raises(checkpoint.DamagedError, match=r"000000000048 is intact: --fork .* begins a new run with it"):
+        train(tmp_path)
+
+
 def test_no_checkpoint_is_given_up_for_a_damaged_one_at_the_end(finished, tmp_path):
     train(tmp_path, terminate, "env step 112")
     (before,) = (tmp_path / "checkpoints").glob("*112")

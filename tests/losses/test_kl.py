@@ -31,6 +31,12 @@ def test_unimix_bounds_the_probabilities_of_extreme_logits():
     np.testing.assert_allclose(np.exp(out), [0.9925, 0.0025, 0.0025, 0.0025], rtol=1e-5)
 
 
+@pytest.mark.parametrize("mix", [-0.1, 1.5])
+def test_a_mix_that_is_no_share_is_refused(mix):
+    with pytest.raises(ValueError, match="expected a mix from 0 to 1"):
+        unimix_logits(jnp.zeros(3), mix)
+
+
 def test_categorical_kl_equals_scipy_and_ignores_normalisation():
     p, q = logits(1), logits(2)
     want = scipy.stats.entropy(mixed(p, 0), mixed(q, 0), axis=-1)

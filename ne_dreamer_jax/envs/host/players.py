@@ -98,6 +98,7 @@ class GymnasiumPlayer:
     """A ``gymnasium.Env``: terminated is terminal, truncated is last alone."""
 
     def __init__(self, env: Any, options: Options) -> None:
+        _expect(env, "a gymnasium.Env", ("observation_space", "action_space", "reset", "step"))
         self._env, self._repeat = env, options.action_repeat
         self._observe = _Observed(env.observation_space, options, env.render)
         size, discrete, self._action = spaces.action(env.action_space)
@@ -129,6 +130,7 @@ class DmEnvPlayer:
     """A ``dm_env.Environment``: the last step is terminal where its discount is 0."""
 
     def __init__(self, env: Any, options: Options, camera: int | str = 0) -> None:
+        _expect(env, "a dm_env.Environment", ("observation_spec", "action_spec", "reset", "step"))
         self._env, self._repeat, self._size, self._camera = env, options.action_repeat, options.image_size or 64, camera
         self._observe = _Observed(_without_bounds(env.observation_spec()), options, self._render)
         size, discrete, self._action = spaces.action(_dm_action(env.action_spec()))
@@ -168,6 +170,12 @@ class DmEnvPlayer:
         if physics is None:
             raise ValueError("obs: expected 'own' for a dm_env environment without physics to draw, got pixels")
         return physics.render(self._size, self._size, camera_id=self._camera)
+
+
+def _expect(env: Any, kind: str, has: tuple[str, ...]) -> None:
+    """Raises ValueError for what a factory returned in place of an environment."""
+    if missing := [name for name in has if not hasattr(env, name)]:
+        raise ValueError(f"expected {kind} of the factory, got {env!r:.80}, which has no {' and no '.join(missing)}")
 
 
 class _Bounds(NamedTuple):

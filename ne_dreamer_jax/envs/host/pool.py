@@ -280,7 +280,7 @@ class Pool:
         if self._failures[i] > FAILURES:
             raise HostEnvError(f"{why}; {FAILURES} failures came before it, without an episode that ended in between")
         if isinstance(answer, Failed):
-            self._report(f"{why}; it is made anew, and its episode is cut.")
+            self._report(f"{why}; it is made anew{'' if first else ', and its episode is cut'}.")
         return Lost(why)
 
     def _note(self, i: int, answer: Seen | Lost) -> None:
