@@ -210,6 +210,7 @@ def test_a_run_is_diagnosed_and_the_result_kept(run):
     assert "decoded" not in told  # no images
     assert [line.split(" ")[0] for line in lines] == [
         "an",  # environment given in code
+        "Compiling,",
         "policy",
         "Known",
         "Predicted",
