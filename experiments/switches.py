@@ -9,11 +9,12 @@ agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import json
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,11 +102,20 @@ def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, A
         for line in train(config, variant, range(done, seeds), found):
             say(f"  seed {line['seeds'] - 1}: {' '.join(f'{x:.1f}' for x in line['curves'][-1])}")
             found = line
-            out.parent.mkdir(parents=True, exist_ok=True)
-            others = itertools.filterfalse(is_same, _read(out))  # another command may have added to them
-            write_text(out, "".join(json.dumps(each) + "\n" for each in [*others, line]))
+            _keep(out, line, is_same)
     assert found is not None
     return found | {"seeds": seeds, "curves": found["curves"][:seeds]}
+
+
+def _keep(out: Path, line: dict[str, Any], is_same: Callable[[dict[str, Any]], bool]) -> None:
+    """Adds a line to the file in place of the ``same`` variant's with fewer seeds. Other commands may do so, too."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.with_name(f".{out.name}.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        lines = _read(out)
+        furthest = max([line, *filter(is_same, lines)], key=lambda each: each["seeds"])
+        kept = [*itertools.filterfalse(is_same, lines), furthest]
+        write_text(out, "".join(json.dumps(each) + "\n" for each in kept))
 
 
 def train(

@@ -263,12 +263,13 @@ def override(config: Config, assignment: str) -> Config:
     """
     path, _, task = assignment.partition("=")
     if path.strip() == "env.task":
-        if isinstance(config.agent, DrQv2Config) and drqv2.for_task(task.strip()) != drqv2.for_task(config.env.task):
+        env = env_configs.for_task(task.strip(), config.env)
+        if isinstance(config.agent, DrQv2Config) and drqv2.for_task(env.task) != drqv2.for_task(config.env.task):
             raise ValueError(
-                f"env.task: DrQ-v2 has other settings for {task.strip()} than for {config.env.task}; expected the task "
+                f"env.task: DrQ-v2 has other settings for {env.task} than for {config.env.task}; expected the task "
                 "before the method: --task on the command line"
             )
-        return replace(config, env=env_configs.for_task(task.strip(), config.env))
+        return replace(config, env=env)
     changed = settings.override(config, assignment)
     old, new = config.agent, changed.agent
     if isinstance(new, DrQv2Config):

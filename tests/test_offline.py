@@ -99,6 +99,9 @@ def test_an_agent_that_learns_again_is_not_compiled_again():
     state, held, _ = loop.train_offline(counting, state, held, jax.random.key(2), updates=2)
     assert len(traced) == times
     assert int(state.update) == 3
+    larger = counting._replace(config=dataclasses.replace(agent.config, batch_size=2 * agent.config.batch_size))
+    loop.train_offline(larger, state, held, jax.random.key(3), updates=1)
+    assert traced[-1].reward.shape[0] == 2 * agent.config.batch_size
 
 
 def test_skipped_updates_are_counted_and_not_in_the_means():

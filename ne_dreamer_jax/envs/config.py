@@ -77,7 +77,7 @@ class WorkersConfig:
     workers: Annotated[int, Range(1, 65_536)] | None = None
     """At most one an environment; none: as many as there are processors."""
     step_seconds: Annotated[float, Range(0.001, 1e6)] = 60.0
-    """What a step may take before its worker counts as hung."""
+    """What a step may take. A worker counts as hung after as many times that as it has environments."""
     on_failure: Literal["restart", "stop"] = "restart"
     """Whether the run goes on with a new worker in place of one that failed, or is saved and stopped."""
 

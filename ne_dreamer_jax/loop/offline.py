@@ -50,13 +50,16 @@ def train_offline(
 
 
 class _Learner:
-    """An agent, by which its program is found again; the same update is the same agent."""
+    """An agent, by which its program is found again: the same update and the same settings."""
 
     def __init__(self, agent: Agent) -> None:
         self.agent = agent
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Learner) and self.agent.train_step is other.agent.train_step
+        if not isinstance(other, _Learner):
+            return False
+        ours, theirs = self.agent, other.agent
+        return ours.train_step is theirs.train_step and ours.config == theirs.config and ours.spec == theirs.spec
 
     def __hash__(self) -> int:
         return id(self.agent.train_step)
@@ -64,7 +67,7 @@ class _Learner:
 
 @lru_cache(maxsize=8)
 def _program(learner: _Learner, write_latents: bool) -> Callable[..., tuple[Any, ring.Replay, Metrics]]:
-    """Compiled once for an agent, however often it learns."""
+    """Compiled once for an agent, however often it learns; those of the last eight agents are kept."""
     agent, kept = learner.agent, storage.pixels()
 
     def run(state: Any, replay: ring.Replay, key: Array, updates: Array) -> tuple[Any, ring.Replay, Metrics]:

@@ -49,7 +49,7 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
     expect_same(p_logits=p_logits, q_logits=q_logits)
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
-    possible = log_p > -jnp.inf  # 0 log 0 = 0, and so its gradients
+    possible = log_p != -jnp.inf  # 0 log 0 = 0, and so its gradients; NaN stays NaN
     ratio = jnp.where(possible, log_p, 0.0) - jnp.where(possible, log_q, 0.0)
     return jnp.sum(jnp.where(possible, jnp.exp(log_p) * ratio, 0.0), axis=-1)
 

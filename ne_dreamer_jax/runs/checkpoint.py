@@ -224,7 +224,9 @@ def restore(
 
 
 def take_out(found: Checkpoint, item: str, scored: str = "agent") -> None:
-    """Takes a damaged item out of a checkpoint, so that nobody counts on it; its files stay, as ``damaged-ITEM``.
+    """Takes a damaged item out of a checkpoint, so that nobody counts on it.
+
+    Its files stay as ``damaged-ITEM`` until `prune` comes by.
 
     Args:
       scored: the item that the score is of; without it the checkpoint has none.
@@ -277,6 +279,8 @@ def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Co
         if checkpoint is not chosen:
             _discard(checkpoint.path)
             continue
+        for damaged in checkpoint.path.glob("damaged-*"):
+            shutil.rmtree(damaged, ignore_errors=True)
         dropped = [item for item in checkpoint.items if item not in of_best]
         if dropped:
             items = {item: leaves for item, leaves in checkpoint.items.items() if item in of_best}

@@ -119,7 +119,7 @@ def _has_begun(path: Path) -> bool:
 
 
 def _newest(parent: Path) -> checkpoint.Checkpoint:
-    found = checkpoint.checkpoints(RunDirectory(parent).checkpoints)
+    found = [each for each in checkpoint.checkpoints(RunDirectory(parent).checkpoints) if "agent" in each.items]
     if not found:
         raise RefusedError(f"--fork {typed(parent)}: expected a run with a checkpoint, and it has none that is intact")
     return found[0]

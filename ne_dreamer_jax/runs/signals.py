@@ -34,11 +34,13 @@ class Stop:
         self.signal: int | None = None
         self._twice = False  # whether a second one has come, as the watcher has it
         self._echo = echo
+        self._entered = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Stop:
         if threading.current_thread() is not threading.main_thread():
             return self
+        self._entered = True
         heeded = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         self._before = {number: signal.signal(number, self._ask) for number in heeded}
         self._over = threading.Event()
@@ -51,7 +53,7 @@ class Stop:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._before:
+        if not self._entered:
             return
         self._over.set()
         signal.set_wakeup_fd(self._wakeup_before)

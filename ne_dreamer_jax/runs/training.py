@@ -358,7 +358,7 @@ def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: L
     try:
         train, origin = fork.agent(parent, like, echo)
     except (FileNotFoundError, ValueError) as error:  # it was there, and fitted, when the run began
-        raise run_directory.RefusedError(f"{files.parent} names a run to begin with: {error}") from error
+        raise run_directory.RefusedError(f"{parent}, the run to begin with: {error}") from error
     parallel.agreed(0)  # all have looked for a parent before one is written down
     if parallel.is_main_process():
         run_directory.write_parent(files, origin)

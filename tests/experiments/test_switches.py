@@ -69,6 +69,8 @@ def test_seeds_that_are_there_are_kept_whatever_ends_the_command(invoke, tmp_pat
     assert "seed 0:" not in output
     (line,) = map(json.loads, (tmp_path / "out.jsonl").read_text().splitlines())
     assert line["curves"] == RETURNS[VARIANTS[0]]
+    switches._keep(tmp_path / "out.jsonl", line | {"seeds": 1}, lambda _: True)  # of a command that is behind
+    assert json.loads((tmp_path / "out.jsonl").read_text())["seeds"] == 3
     _, output, again = invoke(VARIANTS[0], "--seeds", "2")
     assert len(again) == len(trained) == 2, "fewer seeds are there already"
     assert "| 10 12 | 11.0 |" in output

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from ne_dreamer_jax.runs import checkpoint, metrics, record, run_directory, training
+from ne_dreamer_jax.runs import checkpoint, fork, metrics, record, run_directory, training
 from tests.experiments import stub, toy
 
 LAST = 120
@@ -166,6 +166,9 @@ def damage(found, item):
 def test_a_step_whose_checkpoint_is_damaged_is_saved_again(finished, tmp_path, item):
     train(tmp_path, terminate, "env step 80", minutes=0)
     damage(checkpoint.checkpoints(tmp_path / "checkpoints")[0], item)
+    with pytest.raises(Killed):
+        train(tmp_path, kill, "Compiling the training")
+    assert fork._newest(tmp_path).items.keys() >= {"agent"}, "what is left of it is no parent without an agent"
     _, lines = train(tmp_path, terminate, "env step 80")
     assert any("Passed over a damaged checkpoint" in line for line in lines)
     _, lines = train(tmp_path)
