@@ -168,9 +168,9 @@ def test_a_step_whose_checkpoint_is_damaged_is_saved_again(finished, tmp_path, i
     damage(checkpoint.checkpoints(tmp_path / "checkpoints")[0], item)
     with pytest.raises(Killed):
         train(tmp_path, kill, "Compiling the training")
+    assert item not in checkpoint.checkpoints(tmp_path / "checkpoints")[0].items
     assert fork._newest(tmp_path).items.keys() >= {"agent"}, "what is left of it is no parent without an agent"
-    _, lines = train(tmp_path, terminate, "env step 80")
-    assert any("Passed over a damaged checkpoint" in line for line in lines)
+    train(tmp_path, terminate, "env step 80")
     _, lines = train(tmp_path)
     assert any("Going on from" in line and "000000000080" in line for line in lines)
     assert last_bits(tmp_path) == last_bits(finished[0])
