@@ -109,9 +109,11 @@ def test_a_run_whose_configuration_is_gone_is_refused(tmp_path, left):
     with run_directory.claim(tmp_path, Config()):
         (tmp_path / left).mkdir()
     (tmp_path / "config.json").unlink()
-    with pytest.raises(RefusedError, match=f"holds {left} of a run whose config.json is gone"):  # noqa: SIM117
-        with run_directory.claim(tmp_path, Config()):
-            pass
+    with (
+        pytest.raises(RefusedError, match=f"holds {left} of a run whose config.json is gone"),
+        run_directory.claim(tmp_path, Config()),
+    ):
+        pass
 
 
 def test_reading_what_is_no_run_or_of_another_version(tmp_path):

@@ -160,12 +160,12 @@ def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo,
                 _tell(run, echo)
                 pace.evaluated(values["time/evaluation_seconds"])
                 record.write(counters, values)
-            if schedule.evaluates(step) and step < schedule.total:  # at the end everything is saved below
-                saves.if_best(state, counters, record.score(counters))
-            if schedule.evaluates(step) and missing:
                 if is_main_process:
                     draw(run, files, record, echo)
                 gc.collect()  # cycles that wait for their turn lie scattered, and keep whole pages: 10 kB a chunk
+            if schedule.evaluates(step) and step < schedule.total:  # at the end everything is saved below
+                # Also of an evaluation that stands there already: a kill may have come between the two.
+                saves.if_best(state, counters, record.score(counters))
             (stopped_by,) = parallel.agreed(stop.signal or 0)
             if step == schedule.total or stopped_by:
                 break

@@ -250,12 +250,12 @@ def test_what_cant_begin_an_episode_is_refused_when_it_is_made(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"obs": "pictures"}, "expected obs to be own, pixels or both, got 'pictures'"),
-        ({"image_size": -3}, "expected an image_size of at least 1, or None, got -3"),
-        ({"action_repeat": 0}, "expected an action_repeat of at least 1, got 0"),
-        ({"workers": -1}, "expected at least 1 worker process, or None, got -1"),
-        ({"step_seconds": -1.0}, "expected step_seconds above 0, got -1.0"),
-        ({"on_failure": "stpo"}, "expected on_failure to be restart or stop, got 'stpo'"),
+        ({"obs": "pictures"}, "obs: expected own, pixels or both, got 'pictures'"),
+        ({"image_size": -3}, "image_size: expected an integer from 1 to 4,096, got -3"),
+        ({"action_repeat": 0}, "action_repeat: expected an integer from 1 to 1,000,000, got 0"),
+        ({"workers": -1}, "workers: expected an integer from 1 to 65,536 or none, got -1"),
+        ({"step_seconds": -1.0}, r"step_seconds: expected a number from 0.001 to 1e\+06, got -1.0"),
+        ({"on_failure": "stpo"}, "on_failure: expected restart or stop, got 'stpo'"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(options, message):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from ne_dreamer_jax.envs.config import HostConfig
 from ne_dreamer_jax.envs.host import names
 from ne_dreamer_jax.envs.host.factories import PLAYERS, Made
 from ne_dreamer_jax.envs.host.players import DmEnvPlayer, GymnasiumPlayer, Options
@@ -42,19 +43,16 @@ def _made(player: Any, factory: Callable[[], Any], options: Options | None, work
 
 
 def check(options: Options, workers: Workers) -> None:
-    """Raises ValueError for values that make no sense."""
-    size, processes = options.image_size, workers.processes
-    expected = {
-        "obs to be own, pixels or both": (options.observe, options.observe in ("own", "pixels", "both")),
-        "an image_size of at least 1, or None": (size, size is None or size >= 1),
-        "an action_repeat of at least 1": (options.action_repeat, options.action_repeat >= 1),
-        "at least 1 worker process, or None": (processes, processes is None or processes >= 1),
-        "step_seconds above 0": (workers.step_seconds, workers.step_seconds > 0),
-        "on_failure to be restart or stop": (workers.on_failure, workers.on_failure in ("restart", "stop")),
-    }
-    for what, (got, fits) in expected.items():
-        if not fits:
-            raise ValueError(f"expected {what}, got {got!r}")
+    """Raises ValueError for what no configuration may have either."""
+    size = HostConfig.image_size if options.image_size is None else options.image_size
+    HostConfig(
+        obs=options.observe,
+        image_size=size,
+        action_repeat=options.action_repeat,
+        workers=workers.processes,
+        step_seconds=workers.step_seconds,
+        on_failure=workers.on_failure,
+    )
 
 
 def make(
