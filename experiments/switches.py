@@ -131,7 +131,7 @@ def train(
     import numpy as np
 
     import ne_dreamer_jax as nedreamer
-    from experiments.probes import EVALUATION
+    from experiments.probe_learning import EVALUATION
     from ne_dreamer_jax import loop as loops
     from ne_dreamer_jax.envs import config as env_configs
 

@@ -1,5 +1,6 @@
-"""`ne_dreamer_jax.runs.training`, under the name that scripts of a checkout have for it."""
+"""Building and training a run, under the name that scripts of a checkout have for it."""
 
-from ne_dreamer_jax.runs.training import Run, build, evaluate, train
+from ne_dreamer_jax.runs.run import Run, build
+from ne_dreamer_jax.runs.training import evaluate, train
 
 __all__ = ["Run", "build", "evaluate", "train"]

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 
+from ne_dreamer_jax.runs import run as runs
 from ne_dreamer_jax.runs import run_directory, training
 from ne_dreamer_jax.system import parallel
 from tests.experiments import toy
@@ -25,7 +26,7 @@ def main(logdir: str, processes: str, process: str, port: str, stop_at: str = "n
     if processes != "1":
         parallel.connect(f"127.0.0.1:{port}", int(processes), int(process))
         mesh = parallel.make_mesh(1)
-    run = training.build(toy.config(), toy.env(), mesh)
+    run = runs.build(toy.config(), toy.env(), mesh)
 
     def echo(line: str) -> None:
         print(line, flush=True)

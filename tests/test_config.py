@@ -24,7 +24,7 @@ from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.replay import ring as replay
-from ne_dreamer_jax.runs import training
+from ne_dreamer_jax.runs import run as runs
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout, TimeStep
@@ -604,9 +604,9 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
     monkeypatch.setattr(registry, "make", make)
     changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48", "fast": "true"}
     assert set(changes) == {field.name for field in fields(DmcConfig)}
-    base = training.build(BASE).loop
+    base = runs.build(BASE).loop
     for name, value in changes.items():
-        run = training.build(configs.override(BASE, f"env.{name}={value}"))
+        run = runs.build(configs.override(BASE, f"env.{name}={value}"))
         assert asked[-1] != asked[0], name
         assert (run.loop.budget.vector_steps != base.budget.vector_steps) == (name == "action_repeat")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from experiments import probes as training
-from experiments.probes import DRQV2, DRQV2_UPDATES, WORLD_MODEL
+from experiments import probe_learning as training
+from experiments.probe_learning import DRQV2, WORLD_MODEL
+from experiments.probes import DRQV2_UPDATES, UPDATES, updates
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.envs import probes
 from ne_dreamer_jax.settings import names
@@ -39,7 +42,7 @@ def loop_of(config, probe, updates):
 def test_who_should_solve_a_probe_does_and_who_lacks_the_ability_does_not(method, name, record_property):
     probe = probes.PROBES[name]()
     solved = probe.blind + SOLVED.get(name, 0.8) * (probe.optimum - probe.blind)
-    returns = training.returns(method, name, range(SEEDS.get(name, 1)))
+    returns = training.returns(method, name, range(SEEDS.get(name, 1)), updates(method, name))
     record_property("returns", returns.tolist())
     print(f"{method} on {name}: {returns.round(3)} of {probe.optimum} (blind {probe.blind})")
     if (method, name) in UNABLE:
@@ -68,6 +71,16 @@ def test_the_next_embedding_of_an_echo_is_predicted_from_the_action_alone():
         loss[action] = training.learn(loop_of(config, probe, 600), [0]).metrics["loss/next_embedding"][0]
     print(loss)
     assert loss["current"] < 0.5 * loss["previous"]
+
+
+def test_a_mistyped_probe_is_refused_before_jax_is_loaded():
+    assert tuple(UPDATES) == tuple(probes.PROBES)
+    command = [sys.executable, "-m", "experiments.probes", "--probe", "cues"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert "Did you mean cue?" in run.stderr
+    script = "import sys, experiments.probes; assert 'jax' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
 def test_seeds_learn_at_once_and_each_for_itself():

@@ -171,6 +171,7 @@ def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: 
     """Trains, and ends the program with the run's exit code."""
     from ne_dreamer_jax.runs import checkpoint, progress, resume, training
     from ne_dreamer_jax.runs import fork as forks
+    from ne_dreamer_jax.runs import run as runs
     from ne_dreamer_jax.system import compile_cache, parallel
 
     echo = say if group.process == 0 else lambda line: None
@@ -184,7 +185,7 @@ def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: 
         find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(group.devices) if group.devices * group.processes > 1 else None
-        run = training.build(config, mesh=mesh)
+        run = runs.build(config, mesh=mesh)
         if fork is not None:
             forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
     for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:

@@ -11,82 +11,32 @@ import gc
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from ne_dreamer_jax import loop as loops
-from ne_dreamer_jax.agents import guard, make_agent
-from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
-from ne_dreamer_jax.config import Config, check
-from ne_dreamer_jax.envs import config as env_configs
-from ne_dreamer_jax.envs.base import Env
-from ne_dreamer_jax.envs.config import GIVEN, OwnConfig
-from ne_dreamer_jax.envs.vector import Host, VectorEnv, check_env
-from ne_dreamer_jax.loop import Evaluation, Loop, LoopState, Report
-from ne_dreamer_jax.runs import checkpoint, fork, metrics, pictures, plots, progress, run_directory, video
+from ne_dreamer_jax.envs.config import GIVEN
+from ne_dreamer_jax.loop import Evaluation, LoopState, Report
+from ne_dreamer_jax.runs import metrics, outcome, pictures, plots, progress, run_directory, start, video
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record, Saves, last
-from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
-from ne_dreamer_jax.runs.schedule import Schedule
+from ne_dreamer_jax.runs.run import Run
+from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.runs.signals import Stop
-from ne_dreamer_jax.system import compile_cache, memory, parallel
+from ne_dreamer_jax.system import compile_cache, parallel
 from ne_dreamer_jax.types import images_of
 
 Echo = Callable[[str], None]
 
-
-class Run(NamedTuple):
-    """A configuration made real."""
-
-    config: Config
-    agent: Agent
-    loop: Loop
-    shapes: LoopState  # shapes and dtypes of the whole state
-    step_seconds: float | None = None  # simulated time of an agent step
-    host: Host | None = None  # where the environments are, if they are not in the program
-
-    @property
-    def schedule(self) -> Schedule:
-        """When chunks end and evaluations are due."""
-        return Schedule.of(self.config, self.loop)
-
-
-def own(config: Config) -> Config:
-    """The configuration of a run on an environment that is given as an object: it says so.
-
-    Each of its steps counts for one environment step, unless the configuration says otherwise in an `OwnConfig`.
-    """
-    return config if isinstance(config.env, OwnConfig) else replace(config, env=OwnConfig())
-
-
-def build(config: Config, env: Env | VectorEnv | None = None, mesh: Mesh | None = None) -> Run:
-    """Makes the environment, the agent and the loop of a configuration; allocates nothing.
-
-    Args:
-      env: what to train in, instead of the environment that the configuration names.
-      mesh: of `system.parallel`, to train on several devices.
-
-    Raises:
-      ValueError: what does not fit together, or not into memory.
-    """
-    check(config)
-    if env is None:
-        env = env_configs.make(config.env)
-    else:
-        config = own(config)
-    check_env(env)
-    agent = make_agent(config.agent, env.spec)
-    loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
-    host = env.host if isinstance(env, VectorEnv) else None
-    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds, host)
+NO_EXACT_RESUME = (
+    "The environments run in worker processes, which checkpoints do not hold: a run that is stopped and goes on begins "
+    "their episodes anew. All else resumes as it was."
+)
 
 
 def train(
@@ -104,9 +54,9 @@ def train(
       parent: the run whose agent this one begins with, see `runs.fork`; once begun, it goes on without.
 
     Returns:
-      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, `DIVERGED` where
-      updates were not finite, `NOT_SAVED` where the last checkpoint could not be written, `ENVIRONMENT` where
-      environments in worker processes failed.
+      The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, and those of
+      `runs.outcome`: `DIVERGED` where updates were not finite, `NOT_SAVED` where the last checkpoint could not be
+      written, `ENVIRONMENT` where environments in worker processes failed.
 
     Raises:
       checkpoint.DamagedError: there are checkpoints, and none is intact.
@@ -123,115 +73,159 @@ def train(
             raise
         _tell(run, echo)
         echo(f"Stopped: the environments failed: {run.host.failure}. {last(files, run.loop.frames)}")
-        return ENVIRONMENT
+        return outcome.ENVIRONMENT
     finally:
         run.host.close()
 
 
 def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo, parent: Path | None) -> int:
-    schedule = run.schedule
-    if parallel.is_main_process() and run.config.env.task == GIVEN:
+    is_main_process = parallel.is_main_process()
+    if is_main_process and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
-    state, lines = _start(run, files, start_key, parent, echo)
-    echo(_space(run, files))
-    counters = schedule.counters(state)
-    pace = progress.Pace(schedule)
+    state, lines = start.begin(run, files, start_key, parent, echo)
+    echo(start.space(run, files))
     saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
-    chunk: Any = None
-    frames = None
-    is_main_process = parallel.is_main_process()
     with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
-        record = Record(writer, lines, echo)
-        if parallel.agreed(files.parent.exists() and counters.env_step == 0)[0]:
-            saves.whole(state, counters, None)  # from here on it needs its parent no more
+        training = _Training(run, files, state, Record(writer, lines, echo), saves, evaluation_key, echo)
+        code = training.go_on(stop)
+    if code is None:
+        return training.finish() if is_main_process else 0
+    return code
+
+
+class _Training:
+    """A start of a run on its way: the state of the loop, and what is written of it."""
+
+    def __init__(
+        self,
+        run: Run,
+        files: RunDirectory,
+        state: LoopState,
+        record: Record,
+        saves: Saves,
+        evaluation_key: jax.Array,
+        echo: Echo,
+    ) -> None:
+        self.run, self.files, self.record, self.saves, self.echo = run, files, record, saves, echo
+        self.state, self.evaluation_key = state, evaluation_key
+        self.schedule = run.schedule
+        self.counters = self.schedule.counters(state)
+        self.pace = progress.Pace(self.schedule)
+        self.frames: Any = None  # of this start's last evaluation
+
+    @property
+    def step(self) -> int:
+        """The vector step."""
+        return self.counters.agent_step // self.schedule.num_envs
+
+    def go_on(self, stop: Stop) -> int | None:
+        """Trains chunk after chunk and evaluates; an exit code where that stops before the end, else None."""
+        if parallel.agreed(self.files.parent.exists() and self.counters.env_step == 0)[0]:
+            self.saves.whole(self.state, self.counters, None)  # from here on it needs its parent no more
+        chunk: Any = None
         while True:
-            step = counters.agent_step // schedule.num_envs
-            missing, with_random = parallel.agreed(
-                record.find("eval/return", counters) is None, record.random_return is None
-            )
-            if schedule.evaluates(step) and missing:
-                try:
-                    values, frames = evaluate(run, state, evaluation_key, bool(with_random), echo)
-                except jax.errors.JaxRuntimeError:
-                    if run.host is not None and run.host.failure is not None:  # what was learned is whole
-                        saves.whole(state, counters, None)
-                    raise
-                _tell(run, echo)
-                pace.evaluated(values["time/evaluation_seconds"])
-                record.write(counters, values)
-                if is_main_process:
-                    draw(run, files, record, echo)
-                gc.collect()  # cycles that wait for their turn lie scattered, and keep whole pages: 10 kB a chunk
-            if schedule.evaluates(step) and step < schedule.total:  # at the end everything is saved below
-                # Also of an evaluation that stands there already: a kill may have come between the two.
-                saves.if_best(state, counters, record.score(counters))
+            if self.schedule.evaluates(self.step):
+                self._evaluate()
             (stopped_by,) = parallel.agreed(stop.signal or 0)
-            if step == schedule.total or stopped_by:
-                break
+            if self.step == self.schedule.total or stopped_by:
+                return self._end(stopped_by)
             if chunk is None:
-                chunk = _compile(run, echo)
+                chunk = _compile(self.run, self.echo)
                 continue  # in case that somebody wished to stop meanwhile
-            steps = np.asarray(schedule.end_of_chunk(step) - step, np.int32)
-            began = time.perf_counter()
-            state, report = chunk(state, steps)
-            report = jax.device_get(report)
-            seconds = time.perf_counter() - began
-            before, counters = counters, schedule.counters(state)
-            values = _named(report, before, counters, seconds)
-            record.write(counters, values)
-            echo(pace.line(before, counters, values, seconds))
-            if int(state.counters.skipped) >= run.config.loop.max_skipped:
-                return _diverged(run, files, report, state, echo)
-            _tell(run, echo)
-            if run.host is not None and run.host.should_stop:
-                saves.whole(state, counters, record.score(counters))
-                echo(f"Stopped, as an environment failed (env.on_failure=stop). {last(files, run.loop.frames)}")
-                return ENVIRONMENT
-            if saves.due():
-                saves.whole(state, counters, record.score(counters))
-        saves.whole(state, counters, record.score(counters), goes_on=False)
-        if step < schedule.total:
-            if saves.failed:
-                echo(f"Stopped after {counters.env_step:,} environment steps, of which the last are lost: see above.")
-                return NOT_SAVED
-            echo(f"Stopped after {counters.env_step:,} environment steps. The same command goes on from there.")
-            return 128 + stopped_by
-    return _finish(run, files, state, evaluation_key, record, saves, frames, echo) if is_main_process else 0
+            report = self._advance(chunk)
+            code = self._halted(report)
+            if code is not None:
+                return code
+            if self.saves.due():
+                self._save_whole()
 
-
-def _finish(
-    run: Run,
-    files: RunDirectory,
-    state: LoopState,
-    key: jax.Array,
-    record: Record,
-    saves: Saves,
-    frames: Any,
-    echo: Echo,
-) -> int:
-    """What comes after the last step: pictures, a conclusion and the exit code.
-
-    Args:
-      key: of the run's evaluations.
-      frames: of the last one, if this start of the run had one.
-    """
-    if not saves.failed:
-        saves.prune(keep=1)  # nothing will go on from here
-    # Frames of this start's last evaluation are newer than a video from before the run went on beyond an earlier end.
-    if run.schedule.evaluation and images_of(run.agent.spec) and not (frames is None and files.video.exists()):
-        if frames is None:  # the run was stopped between its last evaluation and here
-            frames = evaluate(run, state, key, False, echo)[1]
-        pictures.attempt(
-            lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
+    def _evaluate(self) -> None:
+        """Evaluates, unless that is recorded for this step already, and keeps the agent if it is the best."""
+        run, record, counters = self.run, self.record, self.counters
+        missing, with_random = parallel.agreed(
+            record.find("eval/return", counters) is None, record.random_return is None
         )
-    draw(run, files, record, echo)
-    for line in _conclusion(run, files, record, int(state.counters.skipped)):
-        echo(line)
-    if saves.failed:
-        echo(f"The end of this run is not saved. Make room in {files.path}, and give the same command again.")
-        return NOT_SAVED
-    return 0
+        if missing:
+            try:
+                values, self.frames = evaluate(run, self.state, self.evaluation_key, bool(with_random), self.echo)
+            except jax.errors.JaxRuntimeError:
+                if run.host is not None and run.host.failure is not None:  # what was learned is whole
+                    self.saves.whole(self.state, counters, None)
+                raise
+            _tell(run, self.echo)
+            self.pace.evaluated(values["time/evaluation_seconds"])
+            record.write(counters, values)
+            if parallel.is_main_process():
+                draw(run, self.files, record, self.echo)
+            gc.collect()  # cycles that wait for their turn lie scattered, and keep whole pages: 10 kB a chunk
+        if self.step < self.schedule.total:  # at the end everything is saved
+            # Also of an evaluation that stands there already: a kill may have come between the two.
+            self.saves.if_best(self.state, counters, record.score(counters))
+
+    def _advance(self, chunk: Any) -> Report:
+        """Trains to the end of a chunk, and records it."""
+        steps = np.asarray(self.schedule.end_of_chunk(self.step) - self.step, np.int32)
+        began = time.perf_counter()
+        self.state, report = chunk(self.state, steps)
+        report = jax.device_get(report)
+        seconds = time.perf_counter() - began
+        before, self.counters = self.counters, self.schedule.counters(self.state)
+        values = _named(report, before, self.counters, seconds)
+        self.record.write(self.counters, values)
+        self.echo(self.pace.line(before, self.counters, values, seconds))
+        return report
+
+    def _halted(self, report: Report) -> int | None:
+        """The exit code where a chunk's updates or environments leave no way to go on."""
+        run = self.run
+        if int(self.state.counters.skipped) >= run.config.loop.max_skipped:
+            # Not saved: no such update has changed the state.
+            self.echo(outcome.diverged(run, self.files, report, self.state))
+            return outcome.DIVERGED
+        _tell(run, self.echo)
+        if run.host is not None and run.host.should_stop:
+            self._save_whole()
+            self.echo(f"Stopped, as an environment failed (env.on_failure=stop). {last(self.files, run.loop.frames)}")
+            return outcome.ENVIRONMENT
+        return None
+
+    def _save_whole(self, goes_on: bool = True) -> None:
+        self.saves.whole(self.state, self.counters, self.record.score(self.counters), goes_on=goes_on)
+
+    def _end(self, stopped_by: int) -> int | None:
+        """Saves everything; the exit code where that is before the end of the budget."""
+        self._save_whole(goes_on=False)
+        if self.step == self.schedule.total:
+            return None
+        trained = f"Stopped after {self.counters.env_step:,} environment steps"
+        if self.saves.failed:
+            self.echo(f"{trained}, of which the last are lost: see above.")
+            return outcome.NOT_SAVED
+        self.echo(f"{trained}. The same command goes on from there.")
+        return 128 + stopped_by
+
+    def finish(self) -> int:
+        """What comes after the last step: pictures, a conclusion and the exit code."""
+        run, files, saves, echo = self.run, self.files, self.saves, self.echo
+        if not saves.failed:
+            saves.prune(keep=1)  # nothing will go on from here
+        # Frames of this start's last evaluation are newer than a video from before the run went on beyond its end.
+        shown = self.frames is None and files.video.exists()
+        if run.schedule.evaluation and images_of(run.agent.spec) and not shown:
+            frames = self.frames
+            if frames is None:  # the run was stopped between its last evaluation and here
+                frames = evaluate(run, self.state, self.evaluation_key, False, echo)[1]
+            pictures.attempt(
+                lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
+            )
+        draw(run, files, self.record, echo)
+        for line in outcome.conclusion(run, files, self.record, int(self.state.counters.skipped)):
+            echo(line)
+        if saves.failed:
+            echo(f"The end of this run is not saved. Make room in {files.path}, and give the same command again.")
+            return outcome.NOT_SAVED
+        return 0
 
 
 def evaluate(run: Run, state: LoopState, key: jax.Array, with_random: bool, echo: Echo) -> tuple[dict[str, float], Any]:
@@ -286,106 +280,6 @@ def draw(run: Run, files: RunDirectory, record: Record, echo: Echo) -> None:
     )
 
 
-def _start(
-    run: Run, files: RunDirectory, key: jax.Array, parent: Path | None, echo: Echo
-) -> tuple[LoopState, list[dict[str, Any]]]:
-    """The state to go on from, and the metrics up to it."""
-    shapes, is_main_process = run.shapes, parallel.is_main_process()
-    if jax.process_count() > 1:  # each reads the whole and keeps its share
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), shapes)
-    apart: Any = ()
-    like: dict[str, Any] = {"agent": shapes.train, "loop": shapes._replace(train=apart)}
-    if run.loop.frames is not None:
-        like["frames"] = run.loop.frames.shapes
-    began = time.perf_counter()
-    try:
-        restored = checkpoint.restore(files.checkpoints, like)
-    except FileNotFoundError:
-        _same_for_all(files, -1)
-        state = jax.block_until_ready(run.loop.init(key))
-        parent = parent or fork.parent_of(files)  # which stands there where the first start was cut short
-        if parent is not None:
-            state = _taken_over(run, files, parent, shapes.train, state, echo)
-        echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
-        return state, _lines(files, -1) if is_main_process else []
-    except ValueError as error:
-        raise run_directory.RefusedError(str(error)) from error
-    except checkpoint.DamagedError as error:
-        raise checkpoint.DamagedError(f"{error}{_agent_left(files, shapes.train)}") from error
-    for reason in restored.skipped:
-        echo(f"Passed over a damaged checkpoint: {reason}")
-    env_step = restored.checkpoint.step
-    echo(f"Going on from {restored.checkpoint.path}, {env_step:,} environment steps.")
-    _same_for_all(files, env_step)
-    if is_main_process:
-        _take_out(restored)
-    if run.loop.frames is not None:
-        run.loop.frames.load(restored.items["frames"])
-    state = restored.items["loop"]._replace(train=restored.items["agent"])
-    return parallel.move(state, run.shapes), _lines(files, env_step) if is_main_process else []
-
-
-def _agent_left(files: RunDirectory, like: Any) -> str:
-    """What can still be done with a run that can't go on: a sentence, or nothing."""
-    try:
-        found = checkpoint.restore(files.checkpoints, {"agent": like}).checkpoint
-    except (checkpoint.DamagedError, FileNotFoundError, ValueError):
-        return ""
-    return f" The agent of {found.path} is intact: --fork {typed(files.path)} begins a new run with it"
-
-
-def _take_out(restored: checkpoint.Restored) -> None:
-    """Lets no checkpoint stand as whole that is damaged: it would keep the run from saving that step again."""
-    for found, item in restored.damaged:
-        try:
-            checkpoint.take_out(found, item)
-        except OSError as error:
-            raise run_directory.RefusedError(f"{found.path} can't be written to: {error.strerror or error}") from error
-
-
-def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
-    """The metrics up to a step; what stands behind it is dropped."""
-    try:
-        return metrics.resume(files.metrics, env_step)
-    except OSError as error:
-        raise run_directory.RefusedError(f"{files.metrics} can't be written: {error.strerror or error}") from error
-    except ValueError as error:
-        raise run_directory.RefusedError(str(error)) from error
-
-
-def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: LoopState, echo: Echo) -> LoopState:
-    """The state with the agent of another run, which ``parent.json`` then names."""
-    try:
-        train, origin = fork.agent(parent, like, echo)
-    except (FileNotFoundError, ValueError) as error:  # it was there, and fitted, when the run began
-        raise run_directory.RefusedError(f"{parent}, the run to begin with: {error}") from error
-    parallel.agreed(0)  # all have looked for a parent before one is written down
-    if parallel.is_main_process():
-        run_directory.write_parent(files, origin)
-    return state._replace(train=parallel.move(train, run.shapes.train))
-
-
-def _space(run: Run, files: RunDirectory) -> str:
-    """What checkpoints take, and whether there is room for them."""
-    items = [run.shapes, *([] if run.loop.frames is None else [run.loop.frames.shapes])]
-    each = sum(checkpoint.nbytes({"item": item}) for item in items)
-    free = checkpoint.free_space(files.path)
-    # Two whole ones stand at a time, and one is being written.
-    wanted = "three, as there are at times" if each <= free else "one"
-    enough = "" if 3 * each <= free else f" WARNING: that is too little for {wanted}"
-    return (
-        f"A checkpoint takes up to {memory.readable(each)}; {memory.readable(free)} are free in {files.path}.{enough}"
-    )
-
-
-def _same_for_all(files: RunDirectory, env_step: int) -> None:
-    if parallel.agreed(env_step) != (env_step,):
-        raise run_directory.RefusedError(
-            f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
-            f"{jax.process_index()}; put --logdir where all of them see it"
-        )
-
-
 def _compile(run: Run, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
     draws = "and draw " if images_of(run.agent.spec) else ""
     echo(f"Compiling the training chunk: act, step {draws}the environments, store, sample, update.")
@@ -400,32 +294,6 @@ def _compile(run: Run, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
     how = "loaded from the cache" if hits else "compiled"
     echo(f"Traced in {traced - began:.1f} s, {how} in {done - traced:.1f} s.")
     return compiled
-
-
-DIVERGED = 3
-"""Exit code of a run that stopped because its updates were not finite."""
-NOT_SAVED = 4
-"""Exit code of a run whose last checkpoint could not be written."""
-ENVIRONMENT = 5
-"""Exit code of a run whose environments, in processes of their own, failed."""
-NO_EXACT_RESUME = (
-    "The environments run in worker processes, which checkpoints do not hold: a run that is stopped and goes on begins "
-    "their episodes anew. All else resumes as it was."
-)
-
-
-def _diverged(run: Run, files: RunDirectory, report: Report, state: LoopState, echo: Echo) -> int:
-    """Says what happened and what can be done; the state, which no such update has changed, is not saved."""
-    counted = {name.removeprefix(guard.PREFIX): value for name, value in report.learning.items()}
-    guilty = sorted(name for name, value in counted.items() if f"{guard.PREFIX}{name}" in report.learning and value)
-    echo(
-        f"Stopped: {int(state.counters.skipped):,} updates in a row were not finite (loop.max_skipped is "
-        f"{run.config.loop.max_skipped:,}) and changed nothing. Not finite were: {', '.join(guilty)}. "
-        f"{last(files, run.loop.frames)} This command would come to the same point again: begin a new run, with --fork "
-        f"{typed(files.path)} from that checkpoint or from the start, with a lower agent.optimizer.learning_rate or "
-        "agent.optimizer.agc; look at the size of the rewards; or set JAX_DEBUG_NANS=True to find the first operation."
-    )
-    return DIVERGED
 
 
 def _tell(run: Run, echo: Echo) -> None:
@@ -453,29 +321,3 @@ def _named(report: Report, before: StepCounts, after: StepCounts, seconds: float
 def _returns(evaluation: Evaluation, prefix: str) -> dict[str, float]:
     mean, deviation = mean_and_deviation(np.asarray(evaluation.returns, np.float64))
     return {f"{prefix}return": mean, f"{prefix}return_std": deviation}
-
-
-def _conclusion(run: Run, files: RunDirectory, record: Record, in_a_row: int) -> list[str]:
-    mean, deviation = record.find("eval/return"), record.find("eval/return_std")
-    lines = [f"Finished {run.config.loop.env_steps:,} environment steps of {run.config.env.task}."]
-    if run.loop.budget.updates == 0:
-        lines.append(progress.NOTHING_LEARNED)
-    if skipped := sum(line.get("train/skipped_updates", 0) for line in record.lines):
-        lines.append(
-            f"{skipped:,.0f} of {run.loop.budget.updates:,} updates were skipped, as their numbers were not finite; "
-            f"{in_a_row:,} of them in a row at the end."
-        )
-    if mean is not None and deviation is not None and record.random_return is not None:
-        lines.append(
-            f"Evaluation return {mean:.1f} ± {deviation:.1f}; a random policy's is "
-            f"{record.random_return[0]:.1f} ± {record.random_return[1]:.1f}."
-        )
-    if files.curve.exists():
-        lines.append(f"  {files.curve}: the learning curve")
-    if files.video.exists():
-        lines.append(f"  {files.video}: an episode of the policy")
-    if run.config.env.task == GIVEN:  # no command can make it
-        lines.append(f"  ne_dreamer_jax.evaluate({str(files.path)!r}, env=...) in Python: more episodes")
-    else:
-        lines.append(f"  python -m ne_dreamer_jax evaluate {typed(files.path)}: more episodes")
-    return lines

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax.runs import checkpoint, fork, metrics, record, run_directory, training
+from ne_dreamer_jax.runs import run as runs
 from tests.experiments import stub, toy
 
 LAST = 120
@@ -324,10 +325,10 @@ def test_a_hang_up_is_ignored_where_it_is_to_be(tmp_path):
 @pytest.mark.slow
 @pytest.mark.strict
 def test_the_real_loop_goes_on_to_the_same_bits(tmp_path):
-    run = training.build(toy.config(), toy.env())
+    run = runs.build(toy.config(), toy.env())
     assert train(tmp_path / "straight", run=run)[0] == 0
     assert train(tmp_path / "stopped", terminate, "env step 80", run=run)[0] == 128 + signal.SIGTERM
-    again = training.build(toy.config(), toy.env())  # as another process would make it
+    again = runs.build(toy.config(), toy.env())  # as another process would make it
     assert train(tmp_path / "stopped", run=again)[0] == 0
     assert last_bits(tmp_path / "stopped") == last_bits(tmp_path / "straight")
     assert measured(tmp_path / "stopped") == measured(tmp_path / "straight")
