@@ -7,12 +7,7 @@ else, so that an evaluation never reads the replay; and "frames", images on the 
       manifest.json                  step, score; of each item: the name, shape, dtype and SHA-256
                                      of every array, and where it stands; the SHA-256 of every file; and a
                                      SHA-256 of all that
-      agent/  loop/  frames/         the items: the bytes of all arrays one after another in one file, ``arrays``
-
-They are written here, by one thread and with plain system calls, so that whatever a disk refuses comes out as one
-error, and nothing is left running. Checkpoints of format 2, whose arrays Orbax wrote, still load: Orbax loads an array
-with flipped bits, and casts one of another dtype, without a word, so an item's files are checked against the manifest
-before it opens them, its arrays after, and what is to be read is compared with what is expected.
+      agent/  loop/  frames/         the items: the bytes of all arrays one after another in one file (`runs.arrays`)
 
 A checkpoint is written beside its place and moved there when it is whole and on disk: what a crash cuts short is never
 seen. One that was damaged later is passed over for the one before it.
@@ -30,22 +25,17 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import jax
-import numpy as np
-
 from ne_dreamer_jax.files import sync_file, write_text
+from ne_dreamer_jax.runs import arrays
 from ne_dreamer_jax.system import memory
 
 MANIFEST = "manifest.json"
 FORMAT = 3
 READABLE = (2, FORMAT)
-ARRAYS = "arrays"
 _PARTIAL = ".partial-"
 _REPLACED = f"{_PARTIAL}old-"  # where a checkpoint stands while another one of the same step takes its place
 
-
-class DamagedError(Exception):
-    """What was read of a checkpoint is not what was saved."""
+DamagedError = arrays.DamagedError
 
 
 class Checkpoint(NamedTuple):
@@ -54,8 +44,8 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     score: float | None  # the evaluation return at this step, where there was an evaluation
-    items: dict[str, dict[str, dict[str, Any]]]  # item -> name of an array -> shape, dtype, sha256
-    files: dict[str, dict[str, str]]  # item -> path of a file in the item's folder -> sha256
+    items: dict[str, arrays.Described]  # item -> its arrays
+    files: dict[str, arrays.Files]  # item -> the files in its folder
 
 
 class SaveError(Exception):
@@ -103,17 +93,6 @@ def save(
             _remove_partial(directory)
 
 
-def nbytes(items: Mapping[str, Any]) -> int:
-    """About what the arrays of these items take on disk."""
-    return sum(_nbytes(leaf) for leaf in jax.tree.leaves(dict(items)) if hasattr(leaf, "dtype"))
-
-
-def _nbytes(leaf: Any) -> int:
-    if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended):
-        return 16 * math.prod(leaf.shape)  # keys
-    return math.prod(leaf.shape) * leaf.dtype.itemsize
-
-
 def free_space(directory: Path) -> int:
     """Bytes that are free where a directory is, or will be."""
     existing = next(path for path in [directory, *directory.absolute().parents] if path.exists())
@@ -122,7 +101,7 @@ def free_space(directory: Path) -> int:
 
 def _check_space(directory: Path, items: Mapping[str, Any]) -> None:
     try:
-        needed, free = nbytes(items), free_space(directory)
+        needed, free = arrays.nbytes(dict(items)), free_space(directory)
     except OSError as error:
         raise SaveError(f"could not save a checkpoint in {directory}: {error.strerror or error}") from error
     if needed > free:
@@ -139,9 +118,7 @@ def _save(directory: Path, step: int, items: Mapping[str, Any], score: float | N
     partial.mkdir()
     described, files = {}, {}
     for item, tree in items.items():
-        arrays = _flatten(tree)
-        places, files[item] = _write_arrays(partial / item, arrays)
-        described[item] = {name: _describe(array) | places[name] for name, array in arrays.items()}
+        described[item], files[item] = arrays.write(partial / item, tree)
     final = directory / f"{step:012d}"
     score = None if score is None or not math.isfinite(score) else float(score)
     saved = Checkpoint(final, step, score, described, files)
@@ -155,27 +132,6 @@ def _save(directory: Path, step: int, items: Mapping[str, Any], score: float | N
     sync_file(directory)
     _remove_partial(directory)
     return saved
-
-
-def _write_arrays(folder: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Writes arrays to one file, and waits until it is on the disk.
-
-    Returns:
-      Where each array stands, with its checksum; and name -> checksum of the file.
-    """
-    folder.mkdir()
-    places, whole = {}, hashlib.sha256()
-    with (folder / ARRAYS).open("xb") as file:
-        for name, array in arrays.items():
-            data = _bytes(array)
-            places[name] = {"offset": file.tell(), "sha256": hashlib.sha256(data).hexdigest()}
-            if _is_key(array):
-                places[name]["impl"] = str(jax.random.key_impl(array))
-            whole.update(data)
-            file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    return places, {ARRAYS: whole.hexdigest()}
 
 
 def restore(
@@ -211,7 +167,7 @@ def restore(
         items: dict[str, Any] = {}
         for item, tree in like.items():
             try:
-                items[item] = _load(checkpoint, item, tree)
+                items[item] = arrays.read(checkpoint.path / item, checkpoint.items[item], checkpoint.files[item], tree)
             except DamagedError as error:
                 skipped.append(str(error))
                 damaged.append((checkpoint, item))
@@ -356,148 +312,13 @@ def _digest_json(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _flatten(tree: Any) -> dict[str, Any]:
-    """Name -> leaf, such as ``train.params.encoder.conv0.kernel``; names are unique."""
-    leaves: dict[str, Any] = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        name = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
-        if not (hasattr(leaf, "shape") and hasattr(leaf, "dtype")):
-            raise TypeError(f"{name}: expected an array, got {leaf!r} of type {type(leaf).__name__}")
-        if name in leaves:
-            raise ValueError(f"two leaves are called {name!r}; a key of a mapping holds a dot")
-        leaves[name] = leaf
-    return leaves
-
-
-def _is_key(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _data(leaf: Any) -> Any:
-    """A typed key's plain uint32 words, and any other array as it is."""
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
-def _describe(array: Any) -> dict[str, Any]:
-    return {"shape": list(array.shape), "dtype": str(array.dtype)}  # a key's dtype names its kind: key<fry>
-
-
-def _bytes(array: Any) -> memoryview:
-    """The array's bytes in C order, of which on a CPU no copy is made."""
-    host: Any = np.ascontiguousarray(_data(array))
-    return host.reshape(-1).view(np.uint8).data
-
-
-def _digest_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _check_files(checkpoint: Checkpoint, item: str) -> None:
-    """Raises DamagedError where a file of the item is gone or not as it was saved; others may lie beside them.
-
-    It comes before Orbax, which reads several arrays at once: when one of them can't be read, it drops the others
-    unfinished, and Python warns of those at any time later.
-    """
-    folder = checkpoint.path / item
-    for name, digest in checkpoint.files[item].items():
-        try:
-            intact = _digest_file(folder / name) == digest
-        except OSError as error:
-            raise DamagedError(f"{folder} is damaged: {name} can't be read: {error}.") from error
-        if not intact:
-            raise DamagedError(f"{folder} is damaged: {name} is not as it was saved.")
-
-
 def check_fit(checkpoint: Checkpoint, item: str, like: Any) -> None:
     """Raises ValueError where an item's arrays have other names, shapes or dtypes than those of a pytree."""
-    expected = {name: _describe(leaf) for name, leaf in _flatten(like).items()}
-    got = {name: {key: leaf[key] for key in ("shape", "dtype")} for name, leaf in checkpoint.items[item].items()}
-    different = [name for name in dict.fromkeys([*expected, *got]) if expected.get(name) != got.get(name)]
-    if different:
-        lines = [f"{name}: expected {_words(expected.get(name))}, got {_words(got.get(name))}" for name in different]
+    lines = arrays.differences(checkpoint.items[item], like)
+    if lines:
         more = [f"and {len(lines) - 5} more"] if len(lines) > 5 else []
         raise ValueError(
             f"{checkpoint.path} holds another {item} than this configuration makes in this environment; "
             f"load it with the configuration, and in an environment with the observations and actions, that it was "
             f"saved under.\n  " + "\n  ".join([*lines[:5], *more])
         )
-
-
-def _words(described: dict[str, Any] | None) -> str:
-    return f"{described['dtype']}{described['shape']}" if described else "nothing"
-
-
-def _load(checkpoint: Checkpoint, item: str, like: Any) -> Any:
-    expected = _flatten(like)
-    _check_files(checkpoint, item)
-    described, folder = checkpoint.items[item], checkpoint.path / item
-    read: dict[str, Any] = {
-        name: _read_array(folder, leaf) for name, leaf in described.items() if "offset" in leaf or "file" in leaf
-    }
-    read |= _read_by_orbax(folder, {name: leaf for name, leaf in expected.items() if name not in read})
-    leaves = []
-    for name, leaf in expected.items():
-        saved, array = described[name], read.pop(name)
-        if hashlib.sha256(_bytes(array)).hexdigest() != saved["sha256"]:
-            raise DamagedError(f"{checkpoint.path}: {item} is damaged: the checksum of {name} does not hold.")
-        if not isinstance(leaf, np.ndarray):
-            array = _placed(array, _target(leaf).sharding)
-        leaves.append(jax.random.wrap_key_data(array, impl=saved["impl"]) if _is_key(leaf) else array)
-    return jax.tree.unflatten(jax.tree.structure(like), leaves)
-
-
-def _read_array(folder: Path, leaf: Mapping[str, Any]) -> np.ndarray:
-    """One array, as numpy's; a key's words. Files of numpy's are of format 2, for what lay on the host."""
-    dtype = np.dtype(np.uint32) if "impl" in leaf else jax.numpy.dtype(leaf["dtype"])
-    if "file" in leaf:  # the view is for bfloat16, which numpy's files know as two bytes
-        return np.load(folder / leaf["file"], allow_pickle=False).view(dtype)
-    shape = _key_shape(leaf) if "impl" in leaf else tuple(leaf["shape"])
-    return np.fromfile(folder / ARRAYS, dtype, math.prod(shape), offset=leaf["offset"]).reshape(shape)
-
-
-def _key_shape(leaf: Mapping[str, Any]) -> tuple[int, ...]:
-    """Of the words of keys."""
-    words = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=leaf["impl"]))).shape
-    return (*leaf["shape"], *words)
-
-
-def _target(leaf: Any) -> jax.ShapeDtypeStruct:
-    """Shape, dtype and place of an array to be read; of a key's words, for a key."""
-    data = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-    sharding = None if _is_key(leaf) else getattr(leaf, "sharding", None)
-    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=sharding or device)
-
-
-def _placed(array: Any, sharding: Any) -> jax.Array:
-    """An array where it belongs; each device gets its share alone."""
-    if isinstance(array, jax.Array):
-        return array
-    return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
-
-
-def _read_by_orbax(folder: Path, expected: Mapping[str, Any]) -> dict[str, Any]:
-    """The arrays of a checkpoint of format 2; Orbax refused those without elements."""
-    targets = {name: _target(leaf) for name, leaf in expected.items()}
-    stored = {name: target for name, target in targets.items() if math.prod(target.shape)}
-    empty = {
-        name: jax.numpy.zeros(target.shape, target.dtype) for name, target in targets.items() if name not in stored
-    }
-    if not stored:
-        return empty
-    with _checkpointer() as checkpointer:
-        return checkpointer.restore(folder.absolute(), stored) | empty
-
-
-def _checkpointer() -> Any:
-    """Orbax's, of this process alone: it would otherwise wait for all processes of a run."""
-    import orbax.checkpoint as ocp
-
-    if jax.process_count() == 1:
-        return ocp.StandardCheckpointer()
-    own = jax.process_index()
-    options = ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-    )
-    return ocp.StandardCheckpointer(multiprocessing_options=options)

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 from ne_dreamer_jax.loop import LoopState
-from ne_dreamer_jax.runs import checkpoint, fork, metrics, run_directory
+from ne_dreamer_jax.runs import arrays, checkpoint, fork, metrics, run_directory
 from ne_dreamer_jax.runs.run import Run
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.system import memory, parallel
@@ -109,7 +109,7 @@ def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: L
 def space(run: Run, files: RunDirectory) -> str:
     """What checkpoints take, and whether there is room for them."""
     items = [run.shapes, *([] if run.loop.frames is None else [run.loop.frames.shapes])]
-    each = sum(checkpoint.nbytes({"item": item}) for item in items)
+    each = sum(arrays.nbytes(item) for item in items)
     free = checkpoint.free_space(files.path)
     # Two whole ones stand at a time, and one is being written.
     wanted = "three, as there are at times" if each <= free else "one"

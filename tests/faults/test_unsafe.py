@@ -12,7 +12,7 @@ import pytest
 
 import ne_dreamer_jax
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax.runs import checkpoint, evaluation, metrics, run_directory
+from ne_dreamer_jax.runs import arrays, checkpoint, evaluation, metrics, run_directory
 from ne_dreamer_jax.runs.run_directory import RefusedError
 
 PACKAGE = Path(ne_dreamer_jax.__file__).parent
@@ -101,7 +101,7 @@ def folder(tmp_path):
 
 def test_a_pickle_in_the_place_of_an_array_is_refused_and_not_run(folder, tmp_path):
     np.save(folder / "agent" / "0.npy", np.array([Evil(tmp_path / "ran")]), allow_pickle=True)
-    digest = checkpoint._digest_file(folder / "agent" / "0.npy")
+    digest = arrays.digest_file(folder / "agent" / "0.npy")
     leaf = {"shape": [4], "dtype": "float32", "sha256": 64 * "0", "file": "0.npy"}
     sealed(folder, format=2, items={"agent": {"x": leaf}}, files={"agent": {"0.npy": digest}})
     with pytest.raises((ValueError, checkpoint.DamagedError), match=r"allow_pickle=False|damaged"):
