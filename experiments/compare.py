@@ -7,6 +7,7 @@ of its own, and draws all of it into one figure.
 from __future__ import annotations
 
 import csv
+import signal
 import statistics
 import subprocess
 import sys
@@ -56,7 +57,10 @@ class Asked(NamedTuple):
         """One run's settings. Raises ValueError where they do not fit together."""
         from experiments.train import configure
 
-        return configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
+        config = configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
+        if config.loop.eval_every is None:
+            raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
+        return config
 
 
 class Found(NamedTuple):
@@ -124,6 +128,7 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
       RefusedError, ValueError: as `finished`.
     """
     place = lambda method, seed: directory / method.replace("/", "-") / f"seed{seed}"
+    asked.config(methods[0], 0)
     # All of them before the first one trains: a run of other settings is no part of this comparison.
     runs = [(method, seed) for seed in range(seeds) for method in methods]
     done = {run for run in runs if finished(place(*run), asked, *run)}
@@ -135,7 +140,7 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
                 continue
             say(f"\n{method}, seed {seed}: {path}")
             code = train(path, asked.options(method, seed))
-            if code < 0 or code > 128:
+            if code in (128 + signal.SIGINT, 128 + signal.SIGTERM):  # somebody stopped the run, and so all of this
                 raise SystemExit(code)
             if code:
                 failed[method, seed] = code
@@ -143,9 +148,28 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
 
 
 def train(path: Path, options: Sequence[str]) -> int:
-    """One run, in a process of its own; its exit code."""
+    """One run, in a process of its own; its exit code, 128 + n where signal n ended it.
+
+    On Ctrl-C or SIGTERM the run saves itself, which is waited for. Raises SystemExit then.
+    """
     arguments = [sys.executable, "-m", "ne_dreamer_jax", "train", *options, "--logdir", as_argument(path)]
-    return subprocess.run(arguments, check=False).returncode
+    stopped: list[int] = []
+    with subprocess.Popen(arguments) as run:
+
+        def stop(signum: int, _: object) -> None:
+            stopped.append(signum)
+            if signum != signal.SIGINT:  # which a terminal sends to all of its processes
+                run.send_signal(signum)
+
+        before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            code = run.wait()
+        finally:
+            for signum, handler in before.items():
+                signal.signal(signum, handler)
+    if stopped:
+        raise SystemExit(128 + stopped[0])
+    return code if code >= 0 else 128 - code
 
 
 def finished(path: Path, asked: Asked, method: str, seed: int) -> bool:

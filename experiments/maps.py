@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +29,10 @@ class PlayerName(click.ParamType):
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The value, if somebody is called that or a run lies there."""
-        marker = run_directory.RunDirectory(Path(value).expanduser()).marker
-        if value not in PLAYERS and not marker.exists():
+        if value in PLAYERS:
+            return value
+        path = UserPath().convert(value, param, ctx)
+        if not os.path.exists(run_directory.RunDirectory(path).marker):  # False for what can be no path, too
             self.fail(
                 f"no player is called {value!r}, and no run lies there. {did_you_mean(value, PLAYERS)} Or the --logdir "
                 "of a run that was trained",

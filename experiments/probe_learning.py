@@ -57,7 +57,7 @@ DRQV2 = DrQv2Config(
     steps_per_update=float(STEPS_PER_UPDATE),
 )
 PICTURES = {"dreamerpro"}
-"""They need images."""
+"""Methods that need images."""
 
 
 def learner(method: str) -> AgentConfig | DrQv2Config:

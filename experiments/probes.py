@@ -11,7 +11,7 @@ import time
 
 import click
 
-from ne_dreamer_jax.commands.options import Name
+from ne_dreamer_jax.commands.options import Name, find_devices, refusing, say
 from ne_dreamer_jax.settings import names
 
 UPDATES = {"bandit": 600, "two_steps": 1_200, "cue": 5_000, "cue_again": 5_000, "target": 4_000, "echo": 1_200}
@@ -35,14 +35,17 @@ def main(methods: tuple[str, ...], chosen: tuple[str, ...], seeds: int) -> None:
     from experiments import probe_learning
     from ne_dreamer_jax.envs import probes
 
-    click.echo("| method | probe | blind | median | seeds | minutes |\n| --- | --- | --- | --- | --- | --- |")
+    with refusing(ValueError):
+        find_devices()
+    say("| method | probe | blind | median | seeds | minutes |\n| --- | --- | --- | --- | --- | --- |")
     for method in methods or names.METHODS:
         for name in chosen or UPDATES:
             begin = time.monotonic()
-            found = probe_learning.returns(method, name, range(seeds), updates(method, name))
+            with refusing(ValueError):
+                found = probe_learning.returns(method, name, range(seeds), updates(method, name))
             blind, minutes = probes.PROBES[name]().blind, (time.monotonic() - begin) / 60
             each = " ".join(f"{value:.2f}" for value in found)
-            click.echo(f"| `{method}` | {name} | {blind:.2f} | {np.median(found):.2f} | {each} | {minutes:.1f} |")
+            say(f"| `{method}` | {name} | {blind:.2f} | {np.median(found):.2f} | {each} | {minutes:.1f} |")
 
 
 if __name__ == "__main__":

@@ -7,12 +7,13 @@ what is not finished. submitit starts them: as processes of this machine, or as 
 from __future__ import annotations
 
 import itertools
+import os
 import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from ne_dreamer_jax.commands.options import Name, Task, UserPath, say
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
 
+GPUS = "CUDA_VISIBLE_DEVICES"
 POLL = 2.0  # seconds between two looks at the jobs
 
 
@@ -36,13 +38,20 @@ class Run(NamedTuple):
 class Job:
     """Runs a command in a job; what a preempted job is put back in the queue with, and then goes on."""
 
-    def __init__(self, command: Sequence[str]) -> None:
-        self.command = tuple(command)
+    def __init__(self, command: Sequence[str], variables: Mapping[str, str | None] | None = None) -> None:
+        """A job of a command.
+
+        Args:
+          variables: of the environment, to be set, or for None to be unset, whatever the job's launcher has made them.
+        """
+        self.command, self.variables = tuple(command), dict(variables or {})
         self._process: subprocess.Popen | None = None
 
     def __call__(self) -> None:
         """Waits for the command. Raises RuntimeError where it fails."""
-        self._process = subprocess.Popen(self.command)
+        chosen = {**os.environ, **self.variables}
+        variables = {name: value for name, value in chosen.items() if value is not None}
+        self._process = subprocess.Popen(self.command, env=variables)
         code = self._process.wait()
         if code:
             raise RuntimeError(f"exit code {code}: {shlex.join(self.command)}")
@@ -54,7 +63,7 @@ class Job:
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
             self._process.wait()
-        return DelayedSubmission(Job(self.command))
+        return DelayedSubmission(Job(self.command, self.variables))
 
 
 @click.command(context_settings={"max_content_width": 110})
@@ -77,7 +86,7 @@ class Job:
 @click.option("--slurm", is_flag=True, help="Submit SLURM jobs, instead of processes of this machine.")
 @click.option("--partition", help="With --slurm: the partition.")
 @click.option("--gpus", type=click.IntRange(0), default=1, show_default=True, help="With --slurm: GPUs of a job.")
-@click.option("--hours", type=click.IntRange(1), default=24, show_default=True, help="Time limit of a job.")
+@click.option("--hours", type=click.IntRange(1), default=24, show_default=True, help="Time limit of a run.")
 @click.option("--dry-run", is_flag=True, help="Print the commands and exit.")
 def main(
     tasks: tuple[str, ...],
@@ -118,7 +127,9 @@ def main(
     executor.update_parameters(timeout_min=60 * hours, name="ne_dreamer")
     if slurm:
         executor.update_parameters(gpus_per_node=gpus, **({"slurm_partition": partition} if partition else {}))
-    failed = launch(runs, executor, jobs, say)
+    # submitit hides the GPUs from processes of this machine that have asked for none by number.
+    variables = {} if slurm else {GPUS: os.environ.get(GPUS)}
+    failed = launch(runs, executor, jobs, say, variables)
     say(f"{len(runs) - len(failed)} of {len(runs)} runs finished; their directories are in {logdir}.")
     raise SystemExit(1 if failed else 0)
 
@@ -144,11 +155,18 @@ def plan(
     return runs
 
 
-def launch(runs: Sequence[Run], executor: Any, at_once: int, echo: Callable[[str], None]) -> list[Run]:
+def launch(
+    runs: Sequence[Run],
+    executor: Any,
+    at_once: int,
+    echo: Callable[[str], None],
+    variables: Mapping[str, str | None] | None = None,
+) -> list[Run]:
     """Submits the runs, no more than some at once, waits for them all and tells how each ended.
 
     Args:
       executor: of submitit.
+      variables: as of `Job`.
 
     Returns:
       The runs that failed.
@@ -158,7 +176,7 @@ def launch(runs: Sequence[Run], executor: Any, at_once: int, echo: Callable[[str
     while waiting or running:
         while waiting and len(running) < at_once:
             run = waiting.pop(0)
-            running[run] = executor.submit(Job(run.command))
+            running[run] = executor.submit(Job(run.command, variables))
             echo(f"started   {run.name}: {running[run].paths.stdout}")
         for run, job in list(running.items()):
             if not job.done():

@@ -9,6 +9,7 @@ agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import itertools
 import json
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ne_dreamer_jax.commands.options import Name, Task, UserPath, refusing, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, refusing, say
 from ne_dreamer_jax.files import write_text
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.system.pages import use_large_pages
@@ -74,6 +75,8 @@ def main(
     if len(set(variants)) < len(variants):
         raise click.UsageError(f"expected variants that differ, got one twice: {' '.join(variants)}")
     common = (*(SMALL if small else ()), *assignments)
+    if any(setting.startswith("seed=") for text in (*common, *variants) for setting in SETTING.split(text)):
+        raise click.UsageError("seed: each variant has the seeds 0, 1, ..., of which --seeds says how many")
     with refusing(ValueError):
         made = {
             (task, variant): configure(
@@ -82,8 +85,10 @@ def main(
             for task in tasks or (None,)
             for variant in variants
         }
-        _read(out)  # what is no such file is refused before anything trains
-    compared = [_results(out, config, variant, seeds) for (_, variant), config in made.items()]
+        with _locked(out):  # what is no such file, or can't be written, is refused before anything trains
+            _read(out)
+        find_devices()
+        compared = [_results(out, config, variant, seeds) for (_, variant), config in made.items()]
     say("")
     for row in table(compared):
         say(row)
@@ -107,11 +112,22 @@ def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, A
     return found | {"seeds": seeds, "curves": found["curves"][:seeds]}
 
 
+@contextlib.contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Makes other commands wait that would write the file, too. Raises ValueError where its folder can't be written."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        lock = out.with_name(f".{out.name}.lock").open("a")
+    except OSError as error:
+        raise ValueError(f"{out} can't be written: {error.strerror or error}") from error
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def _keep(out: Path, line: dict[str, Any], is_same: Callable[[dict[str, Any]], bool]) -> None:
     """Adds a line to the file in place of the ``same`` variant's with fewer seeds. Other commands may do so, too."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.with_name(f".{out.name}.lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with _locked(out):
         lines = _read(out)
         furthest = max([line, *filter(is_same, lines)], key=lambda each: each["seeds"])
         kept = [*itertools.filterfalse(is_same, lines), furthest]
@@ -125,20 +141,20 @@ def train(
 
     Args:
       before: what was known of the seeds before these.
+
+    Raises:
+      ValueError: settings that do not fit each other, the environment or the memory.
     """
     import jax
     import jax.numpy as jnp
     import numpy as np
 
-    import ne_dreamer_jax as nedreamer
     from experiments.probe_learning import EVALUATION
-    from ne_dreamer_jax import loop as loops
-    from ne_dreamer_jax.envs import config as env_configs
+    from ne_dreamer_jax.runs import building
 
     began = time.monotonic()
-    env = env_configs.make(config.env)
-    agent = nedreamer.make_agent(config.agent, env.spec)
-    loop = loops.make(config.loop, env, agent, config.env.action_repeat)
+    run = building.build(config)
+    loop = run.loop
     say("  Compiling, which takes a minute or more; then a line for each seed.")
     repeat = config.env.action_repeat * config.loop.num_envs
     interval = max(1, (config.loop.eval_every or config.loop.env_steps) // repeat)
@@ -146,12 +162,15 @@ def train(
     curves: list[list[float]] = [] if before is None else list(before["curves"])
     minutes = 0.0 if before is None else before["minutes"]
     for seed in seeds:
-        state, curve, step = loop.init(jax.random.key(seed)), [], 0
+        state, curve, step, skipped = loop.init(jax.random.key(seed)), [], 0, 0.0
         for end in ends:
-            state, _ = loop.chunk(state, jnp.asarray(end - step, jnp.int32))
+            state, report = loop.chunk(state, jnp.asarray(end - step, jnp.int32))
+            skipped += jax.device_get(report).means().get("skipped_updates", 0.0)
             curve.append(float(np.mean(loop.evaluate(state.train.params, jax.random.key(EVALUATION)).returns)))
             step = end
         curves.append(curve)
+        if skipped:
+            say(f"  seed {seed}: {skipped:,.0f} of {loop.budget.updates:,} updates were not finite, and skipped.")
         yield {
             "task": config.env.task,
             "variant": variant,
@@ -161,6 +180,8 @@ def train(
             "minutes": minutes + (time.monotonic() - began) / 60,
             "config": plain(config),
         }
+    if run.host is not None:
+        run.host.close()
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
@@ -221,11 +242,14 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
 
 def difference(values: np.ndarray, others: np.ndarray) -> str:
     """Difference of two means with its 95 % interval (Welch), as text. Needs scipy (the extra ``analysis``)."""
+    import numpy as np
     from scipy import stats
 
-    found = stats.ttest_ind(values, others, equal_var=False)
-    low, high = found.confidence_interval(0.95)
-    return f"{values.mean() - others.mean():+.1f} ({low:+.1f} to {high:+.1f})"
+    apart = values.mean() - others.mean()
+    if np.ptp(values) == np.ptp(others) == 0.0:  # seeds that are all alike say nothing of how others would be
+        return f"{apart:+.1f} (no spread)"
+    low, high = stats.ttest_ind(values, others, equal_var=False).confidence_interval(0.95)
+    return f"{apart:+.1f} ({low:+.1f} to {high:+.1f})"
 
 
 if __name__ == "__main__":

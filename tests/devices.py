@@ -91,8 +91,12 @@ def environments_and_replay() -> dict[str, Any]:
 
 
 def images_on_the_host() -> int:
-    """Wrong pixels of images that go to the host and back, of a size at which a callback's arguments can deadlock."""
-    envs, side, split = 128, 64, parallel.SPLIT
+    """Wrong pixels of images that go to the host and back, of sizes at which a callback's arguments can deadlock."""
+    return _sent(128, 64) + _sent(2**19, 1)  # many pixels, or many tickets
+
+
+def _sent(envs: int, side: int) -> int:
+    split = parallel.SPLIT
     frames = HostFrames(4, envs, {"image": ArraySpec((side, side, 3), jnp.uint8)})
     put = parallel.per_shard(functools.partial(frames.put, "image"), (split, split), split)
     get = parallel.per_shard(functools.partial(frames.get, "image"), (split,), split)

@@ -251,3 +251,11 @@ def test_the_manifest_is_readable_json(tmp_path):
     content = json.loads((saved.path / "manifest.json").read_text())
     assert (content["step"], content["score"]) == (1, 3.5)
     assert content["items"]["loop"]["ring"]["dtype"] == "uint8"
+
+
+def test_a_folder_that_cant_be_read_is_not_an_empty_one(tmp_path):
+    (tmp_path / "checkpoints").write_text("no folder")
+    with pytest.raises(checkpoint.DamagedError, match="checkpoints can't be read: Not a directory"):
+        checkpoint.restore(tmp_path / "checkpoints", {"agent": make()})
+    with pytest.raises(FileNotFoundError):
+        checkpoint.restore(tmp_path / "nothing", {"agent": make()})

@@ -24,7 +24,7 @@ from ne_dreamer_jax.envs.config import DmcConfig
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.objectives import DreamerPro, NextEmbedding, NoObjective, Reconstruction, SameStep
 from ne_dreamer_jax.replay import ring as replay
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building
 from ne_dreamer_jax.runs.schedule import Schedule
 from ne_dreamer_jax.settings import names
 from ne_dreamer_jax.types import ArraySpec, ContinuousAction, EnvSpec, ReturnScale, Rollout, TimeStep
@@ -151,6 +151,12 @@ def test_drqv2s_noise_keeps_step_with_the_loop():
         configs.check(configs.override(config, "agent.steps_per_update=4"))
     with pytest.raises(ValueError, match=r"random_steps: expected loop.prefill, 3,000"):
         configs.check(configs.override(config, "agent.random_steps=5"))
+    many = configs.with_method(configs.override(configs.preset("dmc"), "loop.num_envs=1024"), "drqv2")
+    with pytest.raises(
+        ValueError, match=r"loop.prefill: expected at least 5,120, 5 steps of each of 1,024 .*got 2,000"
+    ):
+        configs.check(many)
+    configs.check(configs.override(many, "loop.prefill=5120"))
     never = configs.with_method(configs.override(configs.preset("dmc"), "loop.replay_ratio=0"), "drqv2")
     assert (never.loop.replay_ratio, never.agent.steps_per_update) == (0, 2)
     configs.check(never)
@@ -604,9 +610,9 @@ def test_every_setting_of_the_environment_reaches_it(monkeypatch):
     monkeypatch.setattr(registry, "make", make)
     changes = {"task": "dmc/reacher_easy", "obs": "both", "action_repeat": "3", "image_size": "48", "fast": "true"}
     assert set(changes) == {field.name for field in fields(DmcConfig)}
-    base = runs.build(BASE).loop
+    base = building.build(BASE).loop
     for name, value in changes.items():
-        run = runs.build(configs.override(BASE, f"env.{name}={value}"))
+        run = building.build(configs.override(BASE, f"env.{name}={value}"))
         assert asked[-1] != asked[0], name
         assert (run.loop.budget.vector_steps != base.budget.vector_steps) == (name == "action_repeat")
 

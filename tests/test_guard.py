@@ -11,7 +11,7 @@ import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.guard import PREFIX, SKIPPED, is_sound
 from ne_dreamer_jax.envs import base
-from ne_dreamer_jax.runs import outcome, run_directory
+from ne_dreamer_jax.runs import endings, run_directory
 from ne_dreamer_jax.runs.record import Record
 from tests import tiny
 from tests.drqv2 import small
@@ -148,8 +148,8 @@ def test_a_run_that_ends_with_skipped_updates_says_how_many(tmp_path):
     run = stub.build(toy.config(), image=False)
     lines = [{"env_step": 8 * n, "train/skipped_updates": n} for n in range(4)]
     record = Record(None, lines, print)
-    said = outcome.conclusion(run, run_directory.RunDirectory(tmp_path), record, 2)
+    said = endings.conclusion(run, run_directory.RunDirectory(tmp_path), record, 2)
     assert f"6 of {run.loop.budget.updates} updates were skipped" in said[1]
     assert "2 of them in a row at the end" in said[1]
-    sound = outcome.conclusion(run, run_directory.RunDirectory(tmp_path), Record(None, [], print), 0)
+    sound = endings.conclusion(run, run_directory.RunDirectory(tmp_path), Record(None, [], print), 0)
     assert "skipped" not in " ".join(sound)

@@ -15,7 +15,9 @@ import pytest
 from ne_dreamer_jax import agents
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.loop import LoopConfig
+from ne_dreamer_jax.loop.collect import transition
 from ne_dreamer_jax.system import memory
+from ne_dreamer_jax.types import TimeStep
 from tests import counting, tiny
 from tests.tiny import assert_same
 
@@ -90,6 +92,19 @@ def test_time_limits_are_held_as_asked(time_limits, field):
     assert np.any(marked.is_last != marked.is_terminal)
     want = getattr(marked, field)
     assert_same(other, marked._replace(is_last=want, is_terminal=want))
+
+
+@pytest.mark.parametrize("time_limits", ["marked", "unmarked", "terminal"])
+def test_what_a_fault_has_cut_is_last_and_not_terminal_whatever_becomes_of_time_limits(time_limits):
+    last, terminal, cut = (jnp.asarray(x) for x in ([1, 1, 1, 0], [0, 0, 1, 0], [1, 0, 0, 0]))
+    step = TimeStep({}, jnp.zeros(4), jnp.zeros(4, bool), last > 0, terminal > 0)
+    policy = counting.stub(counting.env().spec, 2).init_policy(4)
+    held = transition(time_limits, step, policy, policy.prev_action, cut > 0)
+    by_limit = {"marked": (True, False), "unmarked": (False, False), "terminal": (True, True)}[time_limits]
+    assert (held.is_last.tolist(), held.is_terminal.tolist()) == (
+        [True, by_limit[0], True, False],
+        [False, by_limit[1], True, False],
+    )
 
 
 def test_the_state_goes_on_where_replay_ends(filled):
@@ -443,3 +458,10 @@ def test_virtual_devices_have_no_more_memory_than_the_host(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: 10**9)
     alone, divided = (fit_memory(agent, kept, row, budget, jnp.float32, devices)[0] for devices in (1, 8))
     assert divided <= alone < 10**9
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 0.0004, 0.0009])
+def test_replay_ratios_that_cant_be_kept_are_refused(ratio):
+    with pytest.raises(ValueError, match=r"expected 0 \(never learn\) or at least 0.001"):
+        loops.Budget.of(LoopConfig(replay_ratio=ratio), 2, 3, 1)
+    loops.Budget.of(LoopConfig(replay_ratio=0.001), 2, 3, 1)

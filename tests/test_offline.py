@@ -10,6 +10,7 @@ import pytest
 from ne_dreamer_jax import loop, make_agent, replay
 from ne_dreamer_jax.replay import Episode, ring
 from ne_dreamer_jax.system import memory
+from ne_dreamer_jax.types import ArraySpec, DiscreteAction, EnvSpec
 from tests import tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -131,12 +132,27 @@ def test_skipped_updates_are_counted_and_not_in_the_means():
             r"obs\['image'\]: expected uint8\[7, 8, 8, 3\], got uint8\[6, 8, 8, 3\]",
         ),
         ({"is_terminal": np.zeros(6, bool)}, r"episode 1, is_terminal: expected one bool for the whole episode"),
+        ({"is_terminal": 2}, r"episode 1, is_terminal: expected one bool for the whole episode, got 2"),
+        ({"is_terminal": "yes"}, r"episode 1, is_terminal: expected one bool for the whole episode, got yes"),
         ({"reward": np.full(6, np.nan)}, r"episode 1, reward: expected finite numbers, got nan"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_place(changes, message):
     with pytest.raises(ValueError, match=message):
         replay.from_episodes([episode(), episode(**changes)], SPEC, SIZES)
+
+
+@pytest.mark.parametrize("given", [0, 1, 1.0, np.bool_(True), np.int64(0)])
+def test_an_end_may_be_a_number_as_in_data_sets(given):
+    held = replay.from_episodes([episode(is_terminal=given), episode(is_terminal=bool(given))], SPEC, SIZES)
+    assert int(np.sum(held.data.is_terminal)) == 2 * given
+
+
+def test_a_discrete_action_that_would_wrap_round_is_refused():
+    spec = EnvSpec({"vector": ArraySpec((3,), jnp.float32)}, DiscreteAction(3))
+    one = replay.Episode({"vector": np.zeros((3, 3), np.float32)}, np.array([0, 2**32 + 1]), np.zeros(2), False)
+    with pytest.raises(ValueError, match="episode 0, action: expected values from 0 to 2, got 0 to 4294967297"):
+        replay.from_episodes([one], spec, SIZES)
 
 
 def test_too_little_data_is_refused():

@@ -50,7 +50,7 @@ def test_an_update_is_the_authors(method, actions):
         ("continuous", "objective.masked=true"),
         ("continuous", "objective.sample_deviation=false"),
         ("continuous", "optimizer.agc=0.2"),
-        ("continuous", "optimizer.agc_pmin=1e-2"),
+        ("continuous", "optimizer.agc_pmin=1.0"),
         ("continuous", "optimizer.beta1=0.8"),
         ("continuous", "optimizer.beta2=0.99"),
         ("continuous", "optimizer.name=adam"),

@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import fcntl
 import json
+import math
 import os
 import subprocess
 import sys
@@ -180,3 +181,10 @@ def test_a_directory_behind_a_link_is_a_directory(tmp_path):
     (tmp_path / "there").mkdir()
     run_directory.check(tmp_path / "link" / "run")
     run_directory.check(tmp_path / "link")
+
+
+def test_results_that_are_not_finite_are_null(tmp_path):
+    files = run_directory.RunDirectory(tmp_path)
+    run_directory.write_evaluation(files, {"return": math.inf, "returns": (1.0, math.nan), "episodes": 2})
+    stored = json.loads(files.evaluation.read_text(), parse_constant=pytest.fail)
+    assert stored == {"return": None, "returns": [1.0, None], "episodes": 2}

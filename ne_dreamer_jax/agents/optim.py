@@ -135,8 +135,9 @@ def make(config: OptimizerConfig) -> optax.GradientTransformation:
     which is another average while that rises (``laprop_weighted``). The learning rate of parameters under the name
     ``actor`` is ``actor_rate_factor`` times that.
 
-    With the default epsilon only gradients that are exactly zero, or whose squares' average underflows in float32
-    (below 3e-18), feel it; zero gradients give zero updates.
+    The default epsilon, 1e-20, keeps zero gradients from dividing by zero: they give zero updates. It damps nothing
+    else. Gradients below 3e-18, whose squares' average underflows in float32, are divided by epsilon alone, which is a
+    step of up to 300 learning rates in place of one.
     """
     b1, b2, eps = config.beta1, config.beta2, config.eps
 

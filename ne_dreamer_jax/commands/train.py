@@ -6,6 +6,7 @@ Names are checked here, before JAX loads; `runs.training` does the work.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,6 +31,17 @@ FLAGS = {  # option -> the setting that it changes
     "num_envs": "loop.num_envs",
     "replay_ratio": "loop.replay_ratio",
 }
+
+
+class Minutes(click.FloatRange):
+    """A time; not-a-number is none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number of minutes."""
+        minutes = super().convert(value, param, ctx)
+        if math.isnan(minutes):
+            self.fail(f"expected a number of minutes, got {value!r}", param, ctx)
+        return minutes
 
 
 @click.command(
@@ -82,7 +94,7 @@ FLAGS = {  # option -> the setting that it changes
 )
 @click.option(
     "--checkpoint-minutes",
-    type=click.FloatRange(0),
+    type=Minutes(0),
     metavar="X",
     default=15.0,
     show_default="15",
@@ -169,9 +181,8 @@ class Group(NamedTuple):
 
 def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: float, group: Group) -> None:
     """Trains, and ends the program with the run's exit code."""
-    from ne_dreamer_jax.runs import checkpoint, progress, resume, training
+    from ne_dreamer_jax.runs import building, checkpoint, progress, resume, training
     from ne_dreamer_jax.runs import fork as forks
-    from ne_dreamer_jax.runs import run as runs
     from ne_dreamer_jax.system import compile_cache, parallel
 
     echo = say if group.process == 0 else lambda line: None
@@ -185,7 +196,7 @@ def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: 
         find_devices()
         kept = compile_cache.enable()
         mesh = parallel.make_mesh(group.devices) if group.devices * group.processes > 1 else None
-        run = runs.build(config, mesh=mesh)
+        run = building.build(config, mesh=mesh)
         if fork is not None:
             forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
     for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:

@@ -46,7 +46,7 @@ class Budget:
         n, length = config.num_envs, batch_length
         vector_steps = -(-config.env_steps // (n * action_repeat))
         ratio = Fraction(config.replay_ratio).limit_denominator(1_000)
-        if ratio == 0 and config.replay_ratio != 0:
+        if 0 < config.replay_ratio < 0.001:
             raise ValueError(
                 f"loop.replay_ratio: expected 0 (never learn) or at least 0.001, got {config.replay_ratio}"
             )

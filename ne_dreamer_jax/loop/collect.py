@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any, Literal
 
 import jax
@@ -45,7 +46,10 @@ def collect(
         env_state = env.start(env_state, action)
     with jax.named_scope("replay"):
         obs = storage.encode_obs(env_state, timestep.obs, ring.next_row(state.replay))
-        step = transition(time_limits, timestep._replace(obs=obs), policy, action)
+        cut = jax.tree.map(operator.ne, env.cuts(env_state), env.cuts(state.env))
+        step = transition(
+            time_limits, timestep._replace(obs=obs), policy, action, jnp.logical_or(cut.faults, cut.bad_actions)
+        )
         replay = ring.add(state.replay, step)
 
     ret = jnp.where(timestep.is_first, 0.0, state.episodes.ret) + timestep.reward
@@ -59,11 +63,17 @@ def collect(
     return state._replace(env=env_state, policy=policy, replay=replay, episodes=Episodes(ret, length)), finished
 
 
-def transition(time_limits: TimeLimits, timestep: TimeStep, policy: PolicyState, action: Any) -> Transition:
-    """What replay holds of a step; ``time_limits`` as in `LoopConfig`."""
+def transition(time_limits: TimeLimits, timestep: TimeStep, policy: PolicyState, action: Any, cut: Array) -> Transition:
+    """What replay holds of a step.
+
+    Args:
+      time_limits: as in `LoopConfig`.
+      cut: bool [N], episodes that a fault has cut and no time limit: last, and never terminal.
+    """
     is_last, is_terminal = timestep.is_last, timestep.is_terminal
+    by_limit = is_last & ~is_terminal & ~cut
     if time_limits == "unmarked":
-        is_last = is_terminal
+        is_last = is_last & ~by_limit
     if time_limits == "terminal":
-        is_terminal = is_last
+        is_terminal = is_terminal | by_limit
     return Transition(timestep.obs, action, timestep.reward, timestep.is_first, is_last, is_terminal, policy.latent)

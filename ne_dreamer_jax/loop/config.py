@@ -22,7 +22,7 @@ class LoopConfig:
     capacity: Annotated[int, Range(1, 10**15)] | None = None
     """Transitions that replay holds; none: what the run can fill, at most the paper's 5e6."""
     prefill: CountOrNone = 4_096
-    """Agent steps before the first update."""
+    """Agent steps before the first update; at least a sequence of each environment, of agent.batch_length + 1 steps."""
     chunk_steps: Count = 64
     """Vector steps (agent steps of each environment) of one call to the device, unless that is too many updates."""
     eval_every: Annotated[int, Range(1, 10**15)] | None = 50_000
@@ -37,8 +37,9 @@ class LoopConfig:
     """Whether the posterior latents of an update replace those in replay."""
     time_limits: Literal["marked", "unmarked", "terminal"] = "marked"
     """How replay holds an episode that a time limit cut: ``is_last`` without ``is_terminal``, as the released code for
-    DeepMind Control; neither, as its own limit of 900 steps for DeepMind Lab, so that replayed returns go on into the
-    next episode; or both, as DeepMind Lab's own limits there."""
+    DeepMind Control; neither, as its own limit of 900 steps for DeepMind Lab, so that a world model's replayed returns
+    go on into the next episode (DrQ-v2's end there all the same); or both, as DeepMind Lab's own limits there. What a
+    fault of the environment cut stays last and not terminal."""
     latent_dtype: Literal["float32", "bfloat16"] = "float32"
     """In which replay stores the deterministic latents; bfloat16 halves their share of the memory."""
     storage: Literal["pixels", "states", "host"] = "pixels"

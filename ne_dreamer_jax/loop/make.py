@@ -191,7 +191,7 @@ def row_shapes(config: LoopConfig, env: VectorEnv, agent: Agent, storage: Storag
         env_state = env.prepare(jax.random.split(jax.random.key(0), n))
         kept = storage.encode_obs(env_state, obs, jnp.zeros((), jnp.int32))
         timestep = TimeStep(kept, jnp.zeros((n,), jnp.float32), no, no, no)
-        return transition(config.time_limits, timestep, policy, policy.prev_action)
+        return transition(config.time_limits, timestep, policy, policy.prev_action, no)
 
     return jax.eval_shape(build)
 

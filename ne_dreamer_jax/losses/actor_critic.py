@@ -40,7 +40,8 @@ def reinforce_loss(
     expect_same(log_prob=log_prob, advantage=advantage, entropy=entropy, weight=weight)
     weight, advantage = jax.lax.stop_gradient((weight, advantage))
     objective = advantage.astype(jnp.float32) * log_prob.astype(jnp.float32)
-    return -weight.astype(jnp.float32) * (objective + entropy_scale * entropy.astype(jnp.float32))
+    bonus = jnp.asarray(entropy_scale, jnp.float32) * entropy.astype(jnp.float32)
+    return -weight.astype(jnp.float32) * (objective + bonus)
 
 
 def dynamics_loss(
@@ -71,7 +72,8 @@ def dynamics_loss(
     """
     expect_same(normalized_return=normalized_return, entropy=entropy, weight=weight)
     weight = jax.lax.stop_gradient(weight).astype(jnp.float32)
-    return -weight * (normalized_return.astype(jnp.float32) + entropy_scale * entropy.astype(jnp.float32))
+    bonus = jnp.asarray(entropy_scale, jnp.float32) * entropy.astype(jnp.float32)
+    return -weight * (normalized_return.astype(jnp.float32) + bonus)
 
 
 def critic_loss(

@@ -49,9 +49,11 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
     expect_same(p_logits=p_logits, q_logits=q_logits)
     log_p = jax.nn.log_softmax(p_logits.astype(jnp.float32))
     log_q = jax.nn.log_softmax(q_logits.astype(jnp.float32))
-    possible = log_p != -jnp.inf  # 0 log 0 = 0, and so its gradients; NaN stays NaN
-    ratio = jnp.where(possible, log_p, 0.0) - jnp.where(possible, log_q, 0.0)
-    return jnp.sum(jnp.where(possible, jnp.exp(log_p) * ratio, 0.0), axis=-1)
+    possible, excluded = log_p != -jnp.inf, log_q == -jnp.inf
+    counts = possible & ~excluded  # 0 log 0 = 0, and so its gradients; NaN stays NaN
+    ratio = jnp.where(counts, log_p, 0.0) - jnp.where(counts, log_q, 0.0)
+    finite = jnp.sum(jnp.where(counts, jnp.exp(log_p) * ratio, 0.0), axis=-1)
+    return jnp.where(jnp.any(possible & excluded, axis=-1), jnp.inf, finite)
 
 
 def balanced_kl(

@@ -99,6 +99,7 @@ def update_percentiles(
         now = jnp.sort(returns.ravel())[jnp.round(fractions * (returns.size - 1)).astype(jnp.int32)]
     else:
         now = jnp.quantile(returns, fractions, method=method)
+    low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     return decay * low + (1.0 - decay) * now[0], decay * high + (1.0 - decay) * now[1]
 
 

@@ -43,4 +43,4 @@ def assignment_loss(scores: jax.Array, assignment: jax.Array, temperature: float
     if scores.shape != assignment.shape:
         raise ValueError(f"expected scores and assignments of one shape, got {scores.shape} and {assignment.shape}")
     log_probs = jax.nn.log_softmax(scores.astype(jnp.float32) / temperature, axis=-1)
-    return -jnp.sum(jax.lax.stop_gradient(assignment) * log_probs, axis=-1)
+    return -jnp.sum(jax.lax.stop_gradient(assignment).astype(jnp.float32) * log_probs, axis=-1)

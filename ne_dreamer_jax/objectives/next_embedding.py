@@ -35,9 +35,10 @@ class NextEmbedding:
     alignment: Literal["barlow_twins", "cosine", "vicreg"] = "barlow_twins"
     """How predictions are aligned to embeddings: as in the paper, or by a loss that it names as open."""
     redundancy: NonNegative = 5e-4
-    """Weight of the off-diagonal terms of Barlow Twins."""
+    """Weight of the off-diagonal terms of Barlow Twins; the other alignments have weights of their own."""
     sample_deviation: bool = False
-    """Whether Barlow Twins standardises by the sample's deviation (N - 1; the released code) or the population's."""
+    """Whether Barlow Twins, and it alone, standardises by the sample's deviation (N - 1; the released code) or the
+    population's."""
     action: Literal["current", "previous"] = "current"
     """Whether the predictor at t is fed a_t (the paper) or a_{t-1} (the released code)."""
     masked: bool = True

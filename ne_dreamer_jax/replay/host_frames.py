@@ -77,25 +77,34 @@ class HostFrames:
     def put(self, name: str, tickets: Array, images: Array) -> Array:
         """Stores images ``[n, ...]`` under tickets int32 [n], and returns the tickets once they are stored."""
 
-        shape, dtype = images.shape, images.dtype
-        flat = images.reshape(-1)
-        length = max(1, _PIECE // dtype.itemsize)
-        pieces = [flat[start : start + length] for start in range(0, flat.size, length)]
+        shape = images.shape
 
-        def store(tickets: Any, *pieces: Any) -> np.ndarray:
-            tickets = np.array(tickets)
-            row, env = np.divmod(tickets, self.envs)
-            self.arrays[name][row, env] = np.concatenate([np.asarray(piece) for piece in pieces]).reshape(shape)
-            return tickets
+        def store(tickets: Any, images: Any) -> np.ndarray:
+            stored = _joined(tickets)
+            row, env = np.divmod(stored, self.envs)
+            self.arrays[name][row, env] = _joined(images).reshape(shape)
+            return stored
 
-        return io_callback(store, jax.ShapeDtypeStruct(tickets.shape, tickets.dtype), tickets, *pieces)
+        stored = jax.ShapeDtypeStruct(tickets.shape, tickets.dtype)
+        return io_callback(store, stored, _pieces(tickets), _pieces(images))
 
     def get(self, name: str, tickets: Array) -> Array:
         """The images ``[..., H, W, C]`` of tickets int32 [...]."""
 
-        def fetch(tickets: Any) -> np.ndarray:
-            row, env = np.divmod(np.asarray(tickets), self.envs)
+        def fetch(pieces: Any) -> np.ndarray:
+            row, env = np.divmod(_joined(pieces).reshape(tickets.shape), self.envs)
             return self.arrays[name][row, env]
 
         shape, dtype = self._shapes[name].shape, self._shapes[name].dtype
-        return io_callback(fetch, jax.ShapeDtypeStruct((*tickets.shape, *shape[2:]), dtype), tickets)
+        return io_callback(fetch, jax.ShapeDtypeStruct((*tickets.shape, *shape[2:]), dtype), _pieces(tickets))
+
+
+def _pieces(x: Array) -> list[Array]:
+    """An array's numbers in a row, cut so that none is too large to be an argument of a callback."""
+    flat, length = x.reshape(-1), max(1, _PIECE // x.dtype.itemsize)
+    return [flat[start : start + length] for start in range(0, flat.size, length)]
+
+
+def _joined(pieces: Any) -> np.ndarray:
+    """The numbers of `_pieces` in a row, copied."""
+    return np.concatenate([np.asarray(piece) for piece in pieces])

@@ -66,10 +66,11 @@ def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:
     """An episode's L + 1 steps, [L + 1, ...], without latents."""
     if not isinstance(episode, Episode):
         raise ValueError(f"episode {number}: expected replay.Episode, got {type(episode).__name__}")
-    if np.shape(episode.is_terminal) != ():
+    terminal = np.asarray(episode.is_terminal)
+    if terminal.shape != () or terminal not in (False, True):  # 0 and 1 will do, as data sets have them
         raise ValueError(
-            f"episode {number}, is_terminal: expected one bool for the whole episode, got the shape "
-            f"{list(np.shape(episode.is_terminal))}"
+            f"episode {number}, is_terminal: expected one bool for the whole episode, got "
+            + (f"{terminal}" if terminal.shape == () else f"the shape {list(terminal.shape)}")
         )
     reward = np.asarray(episode.reward)
     length = len(reward) if reward.ndim == 1 else -1
@@ -82,10 +83,10 @@ def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:
     obs = {}
     for name, s in spec.observation.items():
         obs[name] = _expect(number, f"obs[{name!r}]", np.asarray(episode.obs[name]), (length + 1, *s.shape), s.dtype)
+    _expect_range(number, np.asarray(episode.action), spec)  # before a cast, which would wrap round
     action = np.asarray(episode.action, spec.action.dtype)
-    _expect_range(number, action, spec)
     steps = np.arange(length + 1)
-    flags = {"is_first": steps == 0, "is_last": steps == length, "is_terminal": (steps == length) & episode.is_terminal}
+    flags = {"is_first": steps == 0, "is_last": steps == length, "is_terminal": (steps == length) & bool(terminal)}
     return Transition(
         obs=obs,  # type: ignore[arg-type]
         action=np.concatenate([action, np.zeros_like(action[:1])]),  # type: ignore[arg-type]

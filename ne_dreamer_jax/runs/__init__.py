@@ -1,4 +1,4 @@
-"""One run on disk: its directory, metrics, checkpoints, pictures, and the service that trains it."""
+"""One run on disk: its directory, metrics, checkpoints, pictures, and what trains and evaluates it."""
 
 import lazy_loader
 
@@ -6,11 +6,15 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=[
         "api",
+        "arrays",
+        "building",
         "checkpoint",
         "decoding",
         "diagnosis",
+        "endings",
         "evaluation",
         "fork",
+        "maps",
         "metrics",
         "pictures",
         "plots",
@@ -21,6 +25,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "run_directory",
         "schedule",
         "signals",
+        "start",
         "training",
         "video",
     ],

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from ne_dreamer_jax.config import Config
+from ne_dreamer_jax.runs import building, progress, resume, run_directory, training
 from ne_dreamer_jax.runs import fork as forks
-from ne_dreamer_jax.runs import progress, resume, run_directory, training
-from ne_dreamer_jax.runs import run as runs
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.system import compile_cache
 from ne_dreamer_jax.system.quiet import quiet
@@ -63,7 +62,7 @@ def train(
     """
     quiet()
     path = Path(logdir).expanduser()
-    config = config if env is None else runs.own(config)
+    config = config if env is None else building.own(config)
     run_directory.check(path)
     parent = None if fork is None else Path(fork).expanduser()
     config = resume.settle(path, config)
@@ -71,7 +70,7 @@ def train(
         forks.check(parent, path)
     changed = resume.changes(path, config)
     compile_cache.enable()
-    run = runs.build(config, env, mesh)
+    run = building.build(config, env, mesh)
     if parent is not None:
         forks.check_agent(parent, path, config, run.agent.spec, run.shapes.train)
     for line in progress.describe(config, run.loop, run.shapes, changed):

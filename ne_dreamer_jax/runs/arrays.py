@@ -23,7 +23,9 @@ ARRAYS = "arrays"
 """The file's name."""
 
 Described = dict[str, dict[str, Any]]
-"""Name of an array, such as ``params.encoder.conv0.kernel`` -> its shape, dtype, SHA-256, and where it stands."""
+"""Name of an array, such as ``params.encoder.conv0.kernel`` -> ``shape``, ``dtype`` and ``sha256``; ``offset``, the
+byte of `ARRAYS` at which it begins (in format 2 ``file``, a file of numpy's, or neither, for Orbax); ``impl``, the kind
+of typed keys."""
 Files = dict[str, str]
 """Name of a file in the folder -> SHA-256."""
 

@@ -248,8 +248,14 @@ def prune(directory: Path, *, whole: Collection[str], keep: int = 2, of_best: Co
 
 def _find(directory: Path) -> tuple[list[Checkpoint], list[str]]:
     found, damaged = [], []
-    places = {path.name.removeprefix(_REPLACED): path for path in directory.glob(f"{_REPLACED}*")}
-    places |= {path.name: path for path in directory.glob("*") if path.name.isdigit()}
+    try:
+        paths = list(directory.iterdir())
+    except FileNotFoundError:
+        return [], []
+    except OSError as error:  # not to be taken for a directory without checkpoints
+        return [], [f"{directory} can't be read: {error.strerror or error}."]
+    places = {path.name.removeprefix(_REPLACED): path for path in paths if path.name.startswith(_REPLACED)}
+    places |= {path.name: path for path in paths if path.name.isdigit()}
     for name in sorted(places, reverse=True):
         try:
             found.append(_read_manifest(places[name]))

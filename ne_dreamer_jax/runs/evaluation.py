@@ -50,7 +50,7 @@ def load(run: str | Path, env: Any = None, prefer: Prefer = "best") -> Loaded:
       ValueError: the run's environment has no name and none is given, or the one that is given does not fit the agent.
       FileNotFoundError, DamagedError: there is no checkpoint, or none that can be used.
     """
-    path = Path(run)
+    path = Path(run).expanduser()
     config = run_directory.read_config(path, Config)
     if env is None:
         env = env_configs.make(config.env)

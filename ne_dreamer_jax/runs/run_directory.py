@@ -24,6 +24,7 @@ import contextlib
 import fcntl
 import hashlib
 import json
+import math
 import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping
@@ -62,6 +63,11 @@ class RunDirectory(NamedTuple):
     def metrics(self) -> Path:
         """Metrics, one JSON object a line."""
         return self.path / "metrics.jsonl"
+
+    @property
+    def earlier_metrics(self) -> Path:
+        """Metrics of starts that left no checkpoint to go on from."""
+        return self.path / "metrics-earlier.jsonl"
 
     @property
     def checkpoints(self) -> Path:
@@ -263,7 +269,16 @@ def _write_result(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    write_text(path, json.dumps(content, indent=2) + "\n", sync=True)
+    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", sync=True)
+
+
+def _finite(content: Any) -> Any:
+    """The content with null for numbers that are not finite, for which JSON has no word."""
+    if isinstance(content, Mapping):
+        return {name: _finite(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def _digest(content: Mapping[str, Any]) -> str:

@@ -1,24 +1,29 @@
-"""Where a start of a run begins: at its newest whole checkpoint, with another run's agent, or from nothing."""
+"""What training starts from: the run's newest whole checkpoint, another run's agent, or nothing."""
 
 from __future__ import annotations
 
+import json
+import os
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from ne_dreamer_jax import settings
+from ne_dreamer_jax.config import Config
 from ne_dreamer_jax.loop import LoopState
 from ne_dreamer_jax.runs import arrays, checkpoint, fork, metrics, run_directory
-from ne_dreamer_jax.runs.run import Run
+from ne_dreamer_jax.runs.building import Run
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 from ne_dreamer_jax.system import memory, parallel
 
 Echo = Callable[[str], None]
 
 
-def begin(
+def first_state(
     run: Run, files: RunDirectory, key: jax.Array, parent: Path | None, echo: Echo
 ) -> tuple[LoopState, list[dict[str, Any]]]:
     """The state to go on from, and the metrics up to it.
@@ -48,6 +53,8 @@ def begin(
         if parent is not None:
             state = _taken_over(run, files, parent, shapes.train, state, echo)
         echo(f"Made the agent, the environments and replay in {time.perf_counter() - began:.1f} s.")
+        if is_main_process:
+            _set_aside(files, echo)
         return state, _lines(files, -1) if is_main_process else []
     except ValueError as error:
         raise run_directory.RefusedError(str(error)) from error
@@ -84,6 +91,22 @@ def _take_out(restored: checkpoint.Restored) -> None:
             raise run_directory.RefusedError(f"{found.path} can't be written to: {error.strerror or error}") from error
 
 
+def _set_aside(files: RunDirectory, echo: Echo) -> None:
+    """Keeps the metrics of a run that begins anew, as its checkpoints are gone, or were never written."""
+    try:
+        if metrics.read(files.metrics):
+            whole, _, _ = files.metrics.read_bytes().rpartition(b"\n")
+            with files.earlier_metrics.open("ab") as file:
+                file.write(whole + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            echo(f"There is no checkpoint: beginning anew. The metrics so far are in {files.earlier_metrics}.")
+    except ValueError as error:
+        raise run_directory.RefusedError(str(error)) from error
+    except OSError as error:
+        raise run_directory.RefusedError(f"{files.metrics} can't be kept: {error.strerror or error}") from error
+
+
 def _lines(files: RunDirectory, env_step: int) -> list[dict[str, Any]]:
     """The metrics up to a step; what stands behind it is dropped."""
     try:
@@ -98,7 +121,7 @@ def _taken_over(run: Run, files: RunDirectory, parent: Path, like: Any, state: L
     """The state with the agent of another run, which ``parent.json`` then names."""
     try:
         train, origin = fork.agent(parent, like, echo)
-    except (FileNotFoundError, ValueError) as error:  # it was there, and fitted, when the run began
+    except (FileNotFoundError, ValueError, checkpoint.DamagedError) as error:  # there, and fitting, when the run began
         raise run_directory.RefusedError(f"{parent}, the run to begin with: {error}") from error
     parallel.agreed(0)  # all have looked for a parent before one is written down
     if parallel.is_main_process():
@@ -119,8 +142,18 @@ def space(run: Run, files: RunDirectory) -> str:
     )
 
 
+def check_settings(config: Config) -> None:
+    """Raises RefusedError where processes that train together have other settings."""
+    text = json.dumps(settings.to_dict(config), sort_keys=True)
+    if not parallel.same(zlib.crc32(text.encode()) >> 1):
+        raise run_directory.RefusedError(
+            f"expected the same settings in all processes that train together, got others in process "
+            f"{jax.process_index()} than elsewhere; give each of them the same options"
+        )
+
+
 def _same_for_all(files: RunDirectory, env_step: int) -> None:
-    if parallel.agreed(env_step) != (env_step,):
+    if not parallel.same(env_step + 1):
         raise run_directory.RefusedError(
             f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
             f"{jax.process_index()}; put --logdir where all of them see it"

@@ -21,11 +21,11 @@ import numpy as np
 from ne_dreamer_jax.agents.dreamer.agent import parameter_counts
 from ne_dreamer_jax.envs.config import GIVEN
 from ne_dreamer_jax.loop import Evaluation, LoopState, Report
-from ne_dreamer_jax.runs import metrics, outcome, pictures, plots, progress, run_directory, start, video
+from ne_dreamer_jax.runs import endings, metrics, pictures, plots, progress, run_directory, start, video
+from ne_dreamer_jax.runs.building import Run
 from ne_dreamer_jax.runs.evaluation import mean_and_deviation
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record, Saves, last
-from ne_dreamer_jax.runs.run import Run
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.runs.signals import Stop
 from ne_dreamer_jax.system import compile_cache, parallel
@@ -55,7 +55,7 @@ def train(
 
     Returns:
       The exit code: 0 when the run is finished, 128 + the signal's number when it was stopped by one, and those of
-      `runs.outcome`: `DIVERGED` where updates were not finite, `NOT_SAVED` where the last checkpoint could not be
+      `runs.endings`: `DIVERGED` where updates were not finite, `NOT_SAVED` where the last checkpoint could not be
       written, `ENVIRONMENT` where environments in worker processes failed.
 
     Raises:
@@ -71,31 +71,32 @@ def train(
     except jax.errors.JaxRuntimeError:
         if run.host.failure is None:
             raise
-        _tell(run, echo)
+        _say_failures(run, echo)
         echo(f"Stopped: the environments failed: {run.host.failure}. {last(files, run.loop.frames)}")
-        return outcome.ENVIRONMENT
+        return endings.ENVIRONMENT
     finally:
         run.host.close()
 
 
 def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo, parent: Path | None) -> int:
+    start.check_settings(run.config)
     is_main_process = parallel.is_main_process()
     if is_main_process and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code
     start_key, evaluation_key = jax.random.split(jax.random.key(run.config.seed))
-    state, lines = start.begin(run, files, start_key, parent, echo)
+    state, lines = start.first_state(run, files, start_key, parent, echo)
     echo(start.space(run, files))
     saves = Saves(files, 60 * checkpoint_minutes, echo, run.loop.frames)
     with metrics.Writer(files.metrics if is_main_process else Path(os.devnull)) as writer, Stop(echo) as stop:
         training = _Training(run, files, state, Record(writer, lines, echo), saves, evaluation_key, echo)
-        code = training.go_on(stop)
+        code = training.train_to_end(stop)
     if code is None:
         return training.finish() if is_main_process else 0
     return code
 
 
 class _Training:
-    """A start of a run on its way: the state of the loop, and what is written of it."""
+    """One call of `train`: the state of the loop, and the records and checkpoints that are written of it."""
 
     def __init__(
         self,
@@ -119,8 +120,8 @@ class _Training:
         """The vector step."""
         return self.counters.agent_step // self.schedule.num_envs
 
-    def go_on(self, stop: Stop) -> int | None:
-        """Trains chunk after chunk and evaluates; an exit code where that stops before the end, else None."""
+    def train_to_end(self, stop: Stop) -> int | None:
+        """Trains chunk after chunk, and evaluates. None at the budget's end; an exit code where it stops before."""
         if parallel.agreed(self.files.parent.exists() and self.counters.env_step == 0)[0]:
             self.saves.whole(self.state, self.counters, None)  # from here on it needs its parent no more
         chunk: Any = None
@@ -153,7 +154,7 @@ class _Training:
                 if run.host is not None and run.host.failure is not None:  # what was learned is whole
                     self.saves.whole(self.state, counters, None)
                 raise
-            _tell(run, self.echo)
+            _say_failures(run, self.echo)
             self.pace.evaluated(values["time/evaluation_seconds"])
             record.write(counters, values)
             if parallel.is_main_process():
@@ -180,14 +181,14 @@ class _Training:
         """The exit code where a chunk's updates or environments leave no way to go on."""
         run = self.run
         if int(self.state.counters.skipped) >= run.config.loop.max_skipped:
-            # Not saved: no such update has changed the state.
-            self.echo(outcome.diverged(run, self.files, report, self.state))
-            return outcome.DIVERGED
-        _tell(run, self.echo)
+            # Not saved: skipped updates changed no parameter, and going on from here would skip again.
+            self.echo(endings.diverged(run, self.files, report, self.state))
+            return endings.DIVERGED
+        _say_failures(run, self.echo)
         if run.host is not None and run.host.should_stop:
             self._save_whole()
             self.echo(f"Stopped, as an environment failed (env.on_failure=stop). {last(self.files, run.loop.frames)}")
-            return outcome.ENVIRONMENT
+            return endings.ENVIRONMENT
         return None
 
     def _save_whole(self, goes_on: bool = True) -> None:
@@ -201,7 +202,7 @@ class _Training:
         trained = f"Stopped after {self.counters.env_step:,} environment steps"
         if self.saves.failed:
             self.echo(f"{trained}, of which the last are lost: see above.")
-            return outcome.NOT_SAVED
+            return endings.NOT_SAVED
         self.echo(f"{trained}. The same command goes on from there.")
         return 128 + stopped_by
 
@@ -211,8 +212,8 @@ class _Training:
         if not saves.failed:
             saves.prune(keep=1)  # nothing will go on from here
         # Frames of this start's last evaluation are newer than a video from before the run went on beyond its end.
-        shown = self.frames is None and files.video.exists()
-        if run.schedule.evaluation and images_of(run.agent.spec) and not shown:
+        video_stands = self.frames is None and files.video.exists()
+        if run.schedule.evaluation and images_of(run.agent.spec) and not video_stands:
             frames = self.frames
             if frames is None:  # the run was stopped between its last evaluation and here
                 frames = evaluate(run, self.state, self.evaluation_key, False, echo)[1]
@@ -220,11 +221,11 @@ class _Training:
                 lambda: video.write(frames, files.video, fps=video.frame_rate(run.step_seconds)), files.video, echo
             )
         draw(run, files, self.record, echo)
-        for line in outcome.conclusion(run, files, self.record, int(self.state.counters.skipped)):
+        for line in endings.conclusion(run, files, self.record, int(self.state.counters.skipped)):
             echo(line)
         if saves.failed:
             echo(f"The end of this run is not saved. Make room in {files.path}, and give the same command again.")
-            return outcome.NOT_SAVED
+            return endings.NOT_SAVED
         return 0
 
 
@@ -296,8 +297,8 @@ def _compile(run: Run, echo: Echo) -> Callable[[LoopState, jax.Array], Any]:
     return compiled
 
 
-def _tell(run: Run, echo: Echo) -> None:
-    """Says what happened to environments on the host."""
+def _say_failures(run: Run, echo: Echo) -> None:
+    """Says what failed in environments on the host, if there are any."""
     for line in run.host.lines() if run.host is not None else ():
         echo(line)
 

@@ -284,7 +284,10 @@ def _decode_one(annotation: Any, data: Any, path: str, *, default: str | None, t
     if annotation is type(None) and data is None:
         return None
     if annotation is float and isinstance(data, int | float) and not isinstance(data, bool):
-        return float(data)
+        try:
+            return float(data)
+        except OverflowError as error:  # of a whole number
+            raise _Unfit from error
     if annotation in (bool, int, str) and type(data) is annotation:
         return data
     raise _Unfit

@@ -138,6 +138,14 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def same(number: int) -> bool:
+    """Whether all processes hold the same number, below 2**31 - 1; all must call it, and all get the same answer."""
+    if jax.process_count() == 1:
+        return True
+    everyone = np.asarray(multihost_utils.process_allgather(np.asarray(number, np.int32)))
+    return bool((everyone == everyone.flat[0]).all())
+
+
 def agreed(*numbers: int) -> tuple[int, ...]:
     """Small whole numbers as process 0 has them, in every process; all must call it.
 

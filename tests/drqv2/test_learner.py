@@ -129,6 +129,9 @@ def test_acting_is_random_first_then_noisy_and_its_mode_is_the_mean():
         assert float(jnp.max(jnp.abs(action))) < 1.0
         distance = float(jnp.max(jnp.abs(action - mode)))
         assert (distance > 0.3) == (i < 2), "the first 8 agent steps are random, then the noise is 0.05"
+    most = jnp.asarray(2**31 - 2, jnp.int32)
+    policy, _ = agent.act(params, policy._replace(step=most), step, keys[0])
+    assert int(policy.step) == 2**31 - 1, "counted to the end, and not begun anew"
     with pytest.raises(ValueError, match="mode: expected"):
         agent.act(params, policy, step, keys[0], mode="best")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax import config as configs
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building
 from tests.drqv2 import small
 from tests.experiments import test_training, toy
 
@@ -29,7 +29,7 @@ def config():
 
 
 def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path, config):
-    run = runs.build(config, toy.env())
+    run = building.build(config, toy.env())
     train = test_training.train
     assert train(tmp_path / "straight", run=run)[0] == 0
     assert train(tmp_path / "stopped", test_training.terminate, "env step 80", run=run)[0] == 128 + signal.SIGTERM
@@ -45,7 +45,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(tmp_path, config):
 
 def test_the_clocks_of_acting_and_learning_agree(config):
     """Agent steps as acting counts them, and as the updates imply them."""
-    run = runs.build(config, toy.env())
+    run = building.build(config, toy.env())
     steps, updates = run.loop.budget.vector_steps * config.loop.num_envs, run.loop.budget.updates
     implied = run.loop.budget.prefill * config.loop.num_envs + config.agent.steps_per_update * updates
     assert steps - config.agent.steps_per_update <= implied <= steps

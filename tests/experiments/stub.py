@@ -11,14 +11,14 @@ import numpy as np
 
 from ne_dreamer_jax.loop import Budget, Counters, Evaluation, Finished, Loop, LoopState, Report
 from ne_dreamer_jax.replay.host_frames import HostFrames
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building
 from ne_dreamer_jax.types import Array, ArraySpec, ContinuousAction, EnvSpec, ReturnScale, TrainState
 from tests.experiments import toy
 
 EPISODE = 8  # vector steps
 
 
-def build(config, *, image: bool = True) -> runs.Run:
+def build(config, *, image: bool = True) -> building.Run:
     """A run of a configuration."""
     n = config.loop.num_envs
     total = config.loop.env_steps // n
@@ -89,9 +89,9 @@ def build(config, *, image: bool = True) -> runs.Run:
         replay_bytes=rows * n,
         frames=frames,
     )
-    return runs.Run(config, agent, loop, loop.state_shapes())  # type: ignore[arg-type]
+    return building.Run(config, agent, loop, loop.state_shapes())  # type: ignore[arg-type]
 
 
-def run() -> runs.Run:
+def run() -> building.Run:
     """A run of the toy configuration."""
     return build(toy.config())

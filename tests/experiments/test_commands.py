@@ -33,6 +33,7 @@ MISTYPED = {
     ("--obs", "pixel"): "no observation is called 'pixel'. Did you mean pixels?",
     ("--replay-ration", "1"): "No such option '--replay-ration'. Did you mean '--replay-ratio'?",
     ("--env-steps", "0"): "Invalid value for '--env-steps'",
+    ("--checkpoint-minutes", "nan"): "expected a number of minutes, got 'nan'",
 }
 
 

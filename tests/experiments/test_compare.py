@@ -1,5 +1,10 @@
 """Several runs in one figure: which are run, which are found, and what is said about them."""
 
+import os
+import signal
+import threading
+import time
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -133,6 +138,48 @@ def test_a_signal_ends_the_comparison(tmp_path, invoke, monkeypatch):
     code, _, started = invoke(compare, tmp_path, "--method", "dreamerv3", "--method", "r2dreamer", "--seeds", 1)
     assert code == 130
     assert started == [("dreamerv3", "seed0")]
+
+
+@pytest.mark.parametrize(("signum", "trap"), [(signal.SIGTERM, "TERM"), (signal.SIGINT, "INT")])
+def test_a_run_that_is_stopped_saves_itself_before_the_comparison_ends(tmp_path, monkeypatch, signum, trap):
+    """Ctrl-C goes to all processes of a terminal, and here to both; SIGTERM is passed on."""
+    child = tmp_path / "python"
+    save = f"trap 'sleep 1; touch {tmp_path}/saved; exit 143' {trap}"
+    child.write_text(f"#!/bin/sh\n{save}\necho $$ > {tmp_path}/ready\nwhile :; do sleep 0.05; done\n")
+    child.chmod(0o755)
+    monkeypatch.setattr(compare.sys, "executable", str(child))
+
+    def stop():
+        while not (ready := tmp_path / "ready").exists() or not ready.read_text().strip():
+            time.sleep(0.02)
+        time.sleep(0.1)  # until the parent listens
+        if signum == signal.SIGINT:
+            os.kill(int(ready.read_text()), signum)
+        os.kill(os.getpid(), signum)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    with pytest.raises(SystemExit) as end:
+        compare.train(tmp_path / "run", [])
+    thread.join()
+    assert end.value.code == 128 + signum
+    assert (tmp_path / "saved").exists()
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_run_that_was_killed_counts_as_one_that_failed(tmp_path, monkeypatch):
+    child = tmp_path / "python"
+    child.write_text("#!/bin/sh\nkill -9 $$\n")
+    child.chmod(0o755)
+    monkeypatch.setattr(compare.sys, "executable", str(child))
+    assert compare.train(tmp_path / "run", []) == 137
+
+
+def test_a_comparison_without_evaluations_is_refused_before_anything_trains(tmp_path, invoke):
+    code, output, started = invoke(compare, tmp_path, "--set", "loop.eval_every=none")
+    assert code == 2
+    assert "loop.eval_every: expected a number of steps" in output
+    assert started == []
 
 
 def test_the_ablations_are_the_papers(tmp_path, invoke):

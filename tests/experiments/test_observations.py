@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from ne_dreamer_jax.envs.config import DmcConfig
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building
 from tests.experiments import toy
 
 VECTORS = {"orientation": (2,), "velocity": (1,)}  # dm_control's, of the pendulum
 
 
 def build(obs):
-    return runs.build(replace(toy.config(), env=DmcConfig("dmc/pendulum_swingup", obs=obs, image_size=16)))
+    return building.build(replace(toy.config(), env=DmcConfig("dmc/pendulum_swingup", obs=obs, image_size=16)))
 
 
 @pytest.mark.parametrize("obs", ["vector", "both"])

@@ -104,3 +104,15 @@ def test_a_job_that_is_preempted_lets_its_run_save_and_starts_again(tmp_path):
     assert (tmp_path / "saved").read_text() == "yes"
     assert f"exit code {128 + signal.SIGTERM}" in errors[0]
     assert again.function.command == job.command
+
+
+def test_a_run_sees_the_devices_that_the_sweep_sees(monkeypatch):
+    """Whatever the launcher of its job hides."""
+    shows = lambda devices: (
+        sys.executable, "-c", f"import os; raise SystemExit(os.environ.get({sweep.GPUS!r}) != {devices!r})"
+    )  # fmt: skip
+    monkeypatch.setenv(sweep.GPUS, "")
+    sweep.Job(shows("3"), {sweep.GPUS: "3"})()
+    sweep.Job(shows(None), {sweep.GPUS: None})()
+    sweep.Job(shows(""))()
+    assert sweep.Job(shows("3"), {sweep.GPUS: "3"}).checkpoint().function.variables == {sweep.GPUS: "3"}

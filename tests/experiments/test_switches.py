@@ -110,6 +110,8 @@ def test_an_interval_holds_the_difference_that_there_is():
         ([VARIANTS[0], "--task", "dmc/cartpole_swingpu"], "cartpole_swingup"),
         ([], "Missing argument"),
         ([VARIANTS[0], VARIANTS[0]], "expected variants that differ"),
+        (["agent.behavior.lam=0.9,seed=1"], "of which --seeds says how many"),
+        ([VARIANTS[0], "--set", "seed=1"], "of which --seeds says how many"),
     ],
 )
 def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, message):
@@ -117,6 +119,25 @@ def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, mes
     assert code == 2
     assert message in output
     assert trained == []
+
+
+def test_what_does_not_fit_into_memory_is_refused(tmp_path):
+    out = str(tmp_path / "out.jsonl")
+    options = ["--small", "--obs", "vector", "--set", "loop.env_steps=1e12", "--set", "loop.capacity=2e9"]
+    done = CliRunner().invoke(switches.main, [out, VARIANTS[0], *options])
+    assert done.exit_code == 2, done.output
+    assert "expected a capacity of at most" in done.output
+
+
+def test_a_file_that_cant_be_written_is_refused_before_anything_trains(invoke, tmp_path):
+    (tmp_path / "file").touch()
+    done = CliRunner().invoke(switches.main, [str(tmp_path / "file" / "out.jsonl"), VARIANTS[0]])
+    assert done.exit_code == 2, done.output
+    assert "can't be written" in done.output
+
+
+def test_seeds_without_spread_have_no_interval():
+    assert switches.difference(np.full(3, 1000.0), np.zeros(3)) == "+1000.0 (no spread)"
 
 
 @pytest.mark.slow

@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from ne_dreamer_jax.runs import checkpoint, fork, metrics, record, run_directory, training
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building, checkpoint, fork, metrics, record, run_directory, training
 from tests.experiments import stub, toy
 
 LAST = 120
@@ -325,11 +324,26 @@ def test_a_hang_up_is_ignored_where_it_is_to_be(tmp_path):
 @pytest.mark.slow
 @pytest.mark.strict
 def test_the_real_loop_goes_on_to_the_same_bits(tmp_path):
-    run = runs.build(toy.config(), toy.env())
+    run = building.build(toy.config(), toy.env())
     assert train(tmp_path / "straight", run=run)[0] == 0
     assert train(tmp_path / "stopped", terminate, "env step 80", run=run)[0] == 128 + signal.SIGTERM
-    again = runs.build(toy.config(), toy.env())  # as another process would make it
+    again = building.build(toy.config(), toy.env())  # as another process would make it
     assert train(tmp_path / "stopped", run=again)[0] == 0
     assert last_bits(tmp_path / "stopped") == last_bits(tmp_path / "straight")
     assert measured(tmp_path / "stopped") == measured(tmp_path / "straight")
     assert measured(tmp_path / "straight")[-1]["update"] == run.loop.budget.updates
+
+
+def test_metrics_of_a_run_whose_checkpoints_are_gone_are_kept(tmp_path):
+    train(tmp_path)
+    before = (tmp_path / "metrics.jsonl").read_bytes()
+    shutil.rmtree(tmp_path / "checkpoints")
+    code, lines = train(tmp_path)
+    assert code == 0
+    assert any("There is no checkpoint: beginning anew." in line for line in lines)
+    assert (tmp_path / "metrics-earlier.jsonl").read_bytes() == before
+    shutil.rmtree(tmp_path / "checkpoints")
+    second = (tmp_path / "metrics.jsonl").read_bytes() + b'{"env_step": 1'  # a line that was cut short
+    (tmp_path / "metrics.jsonl").write_bytes(second)
+    train(tmp_path)
+    assert (tmp_path / "metrics-earlier.jsonl").read_bytes() == before + second.rpartition(b"\n")[0] + b"\n"

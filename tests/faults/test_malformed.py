@@ -10,8 +10,7 @@ from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import settings
 from ne_dreamer_jax.commands import evaluate as evaluate_command
 from ne_dreamer_jax.commands import train as train_command
-from ne_dreamer_jax.runs import run as runs
-from ne_dreamer_jax.runs import run_directory
+from ne_dreamer_jax.runs import building, run_directory
 from ne_dreamer_jax.runs.run_directory import RefusedError
 from ne_dreamer_jax.system import compile_cache
 from tests.experiments import toy
@@ -36,7 +35,7 @@ def nothing_is_trained(monkeypatch):
     def build(*_, **__):
         raise Accepted
 
-    monkeypatch.setattr(runs, "build", build)
+    monkeypatch.setattr(building, "build", build)
     monkeypatch.setattr(compile_cache, "enable", lambda: "nowhere")
 
 
@@ -155,7 +154,7 @@ def test_whatever_a_configuration_says_is_refused_with_a_sentence_or_fits_togeth
     for _ in range(40):
         change = f"{draw.choice(paths)}={draw.choice(['0', '1', '2', '3', '7', '16', '0.5', 'none', 'true'])}"
         try:
-            runs.build(configs.override(toy.config(), change), toy.env())
+            building.build(configs.override(toy.config(), change), toy.env())
             built += 1
         except ValueError as error:
             said.append(str(error))

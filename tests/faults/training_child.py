@@ -15,8 +15,7 @@ from pathlib import Path
 
 import jax
 
-from ne_dreamer_jax.runs import run as runs
-from ne_dreamer_jax.runs import run_directory, training
+from ne_dreamer_jax.runs import building, run_directory, training
 from ne_dreamer_jax.system.quiet import quiet
 from tests.experiments import toy
 
@@ -25,7 +24,7 @@ def main(logdir: str, moment: str = "never", number: str = "15", again: str = ""
     """Trains; returns the exit code."""
     jax.config.update("jax_disable_most_optimizations", True)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background ignores
-    run = runs.build(toy.config(env_steps=160, eval_every=None), toy.env())
+    run = building.build(toy.config(env_steps=160, eval_every=None), toy.env())
     sent: list[float] = []
 
     def send() -> None:

@@ -52,6 +52,7 @@ def test_a_class_that_is_masked_adds_nothing_to_the_divergence_nor_to_its_gradie
     for gradient, without in zip(gradients, expected, strict=True):
         np.testing.assert_allclose(gradient, [*without, 0.0], rtol=1e-5, atol=1e-7)
     assert categorical_kl(jnp.zeros(3), q) == jnp.inf
+    assert categorical_kl(jnp.asarray([0.0, 0.0, -200.0]), q) == jnp.inf, "however improbable"
     for broken in (jnp.nan, jnp.inf):
         assert jnp.isnan(categorical_kl(jnp.asarray([broken, 0.0, 1.0]), jnp.zeros(3)))
 

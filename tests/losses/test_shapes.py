@@ -1,5 +1,6 @@
 """What does not fit is refused by the names and shapes that the caller passed."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -30,3 +31,23 @@ BINS = jnp.linspace(-1.0, 1.0, 7)
 def test_shapes_that_do_not_agree_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.strict
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.float32])
+def test_losses_are_float32_whatever_they_are_given(dtype):
+    a, logits, one = A.astype(dtype), L.astype(dtype), jnp.ones((), dtype)
+    flag = jnp.zeros(A.shape, bool)
+    for name, found in {
+        "reinforce": losses.reinforce_loss(a, a, a, a, one),
+        "dynamics": losses.dynamics_loss(a, a, a, one),
+        "critic": losses.critic_loss(logits, a, a, a, BINS.astype(dtype)),
+        "returns": losses.lambda_returns(a, a, a, 0.9, flag),
+        "percentiles": losses.update_percentiles(one, one, a),
+        "scale": losses.return_scale(one, one),
+        "kl": losses.balanced_kl(logits, logits),
+        "assignment": losses.assignment_loss(a, a),
+        "sinkhorn": losses.sinkhorn(a),
+        "twohot": losses.twohot_loss(logits, a, BINS.astype(dtype)),
+    }.items():
+        assert {x.dtype for x in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}, name

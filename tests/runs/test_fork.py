@@ -12,7 +12,7 @@ import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax.commands import train as command
 from ne_dreamer_jax.envs.config import DmcConfig
-from ne_dreamer_jax.runs import checkpoint, fork, metrics, outcome, run_directory, training
+from ne_dreamer_jax.runs import checkpoint, endings, fork, metrics, run_directory, training
 from ne_dreamer_jax.runs.run_directory import RefusedError, RunDirectory
 from ne_dreamer_jax.types import ContinuousAction, DiscreteAction
 from tests.experiments import stub, toy
@@ -75,7 +75,7 @@ def test_a_fork_begins_with_the_agent_to_the_bit_and_ends_without_its_parent(par
 def test_a_fork_that_was_cut_short_before_its_first_checkpoint_begins_again(parent, tmp_path, monkeypatch):
     config = toy.config(eval_every=None, env_steps=40)
     monkeypatch.setattr(checkpoint, "free_space", lambda _: 10)
-    assert train(tmp_path / "fork", config, parent, at="Compiling")[0] == outcome.NOT_SAVED
+    assert train(tmp_path / "fork", config, parent, at="Compiling")[0] == endings.NOT_SAVED
     monkeypatch.undo()
     code, lines = train(tmp_path / "fork", config)  # without saying again whose agent it is
     assert code == 0
@@ -161,3 +161,11 @@ def test_the_real_agent_is_taken_over_and_goes_on_to_learn(tmp_path):
     with pytest.raises(ValueError, match="expected an agent of the same shapes"):
         nedreamer.train(wider, tmp_path / "wide", env=toy.env(), fork=tmp_path / "parent", echo=say)
     assert not (tmp_path / "wide").exists()
+
+
+def test_a_parent_that_is_damaged_is_named(parent, tmp_path):
+    gone = shutil.copytree(parent, tmp_path / "gone")
+    for arrays in (gone / "checkpoints").glob("*/agent/arrays"):
+        arrays.write_bytes(b"")
+    with pytest.raises(RefusedError, match=r"gone, the run to begin with: no checkpoint in .* is intact"):
+        train(tmp_path / "fork", toy.config(eval_every=None, env_steps=40), gone)

@@ -15,7 +15,7 @@ import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.envs.host import Workers, from_dm_env, from_gymnasium
-from ne_dreamer_jax.runs import outcome, training
+from ne_dreamer_jax.runs import endings, training
 from tests.envs import host_fakes
 from tests.experiments import toy
 
@@ -77,7 +77,7 @@ def test_a_failure_stops_the_run_where_that_is_chosen_and_the_run_goes_on_later(
         workers=Workers(processes=1, on_failure="stop"),
     )
     code, said = train(tmp_path / "run", env, eval_every=None)
-    assert code == outcome.ENVIRONMENT
+    assert code == endings.ENVIRONMENT
     assert any("the door is stuck" in line for line in said)
     assert "Stopped, as an environment failed (env.on_failure=stop). The last checkpoint is" in said[-1]
     code, said = train(tmp_path / "run", env, eval_every=None)
@@ -112,7 +112,7 @@ def test_a_failure_costs_an_episode_where_the_run_is_to_go_on(tmp_path):
 def test_environments_that_fail_again_and_again_end_the_run_with_a_sentence(tmp_path):
     env = from_gymnasium(functools.partial(host_fakes.Failing, "raises"), workers=Workers(processes=1))
     code, said = train(tmp_path / "run", env, eval_every=None)
-    assert code == outcome.ENVIRONMENT
+    assert code == endings.ENVIRONMENT
     assert "Stopped: the environments failed: environment 0 raised RuntimeError: the door is stuck" in said[-1]
 
 

@@ -13,8 +13,7 @@ from ne_dreamer_jax import config as configs
 from ne_dreamer_jax import settings
 from ne_dreamer_jax.commands import train as command
 from ne_dreamer_jax.envs.config import HostConfig
-from ne_dreamer_jax.runs import checkpoint, metrics, resume, run_directory, training
-from ne_dreamer_jax.runs import run as runs
+from ne_dreamer_jax.runs import building, checkpoint, metrics, resume, run_directory, training
 from ne_dreamer_jax.runs.run_directory import RefusedError
 from tests.experiments import stub, toy
 from tests.experiments.test_commands import invoke
@@ -175,7 +174,7 @@ def test_a_capacity_that_is_named_is_the_same_as_the_one_that_is_not():
     config = toy.config()
     named = replace(config, loop=dataclasses.replace(config.loop, capacity=120))
     assert resume.differences(config, named) == []
-    assert runs.build(config, toy.env()).loop.budget.capacity == 120
+    assert building.build(config, toy.env()).loop.budget.capacity == 120
 
 
 def test_workers_of_environments_may_change_and_what_they_run_may_not():

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from ne_dreamer_jax.runs import checkpoint, metrics, outcome, run_directory, training
+from ne_dreamer_jax.runs import checkpoint, endings, metrics, run_directory, training
 from ne_dreamer_jax.runs.metrics import StepCounts
 from ne_dreamer_jax.runs.record import Record
 from tests.experiments import stub, toy
@@ -25,7 +25,7 @@ def train(path, run=None):
 def test_a_full_disk_costs_the_checkpoints_and_nothing_else(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "free_space", lambda directory: 10)
     code, said = train(tmp_path / "run")
-    assert code == outcome.NOT_SAVED == 4
+    assert code == endings.NOT_SAVED == 4
     refused = [line for line in said if line.startswith("Not saved: ")]
     assert "it takes up to" in refused[0]
     assert "10 B are free; make room there. Training goes on" in refused[0]
@@ -43,7 +43,7 @@ def test_a_disk_that_fills_up_leaves_the_checkpoint_before(tmp_path, monkeypatch
     left = iter([10**9, 10**9, *[10] * 100])
     monkeypatch.setattr(checkpoint, "free_space", lambda directory: next(left))
     code, said = train(tmp_path / "run")
-    assert code == outcome.NOT_SAVED
+    assert code == endings.NOT_SAVED
     (kept,) = checkpoint.checkpoints(tmp_path / "run" / "checkpoints")
     assert any(f"The last checkpoint is {kept.path}" in line for line in said)
     monkeypatch.undo()
@@ -115,7 +115,7 @@ def test_a_save_that_fails_at_the_end_promises_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "save", raising(checkpoint.SaveError("no room")))
     run = stub.build(toy.config(env_steps=40, eval_every=None), image=False)
     with run_directory.claim(tmp_path / "run", run.config) as files:
-        assert training.train(run, files, checkpoint_minutes=60, echo=said.append) == outcome.NOT_SAVED
+        assert training.train(run, files, checkpoint_minutes=60, echo=said.append) == endings.NOT_SAVED
     refused = [line for line in said if line.startswith("Not saved: no room.")]
     assert refused
     assert "Training goes on" not in refused[-1]

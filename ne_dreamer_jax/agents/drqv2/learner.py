@@ -97,7 +97,8 @@ def build(config: DrQv2Config, spec: EnvSpec) -> Functions:
             action = sample(noise_key, action, noise(config, policy.step), jnp.inf)
             random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
             action = jnp.where(policy.step < config.random_steps, random, action)
-        return Policy(policy.latent, action, stacked, policy.step + count), action
+        step = jnp.minimum(policy.step, jnp.iinfo(jnp.int32).max - count) + count  # stays there, and never wraps round
+        return Policy(policy.latent, action, stacked, step), action
 
     def critic_losses(params: Params, state: State, keys: Array, data: Transitions, std: Array) -> tuple[Array, Any]:
         obs = random_shift(keys[0], data.obs, config.shift)

@@ -6,8 +6,8 @@ from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.envs.config import GIVEN
 from ne_dreamer_jax.loop import LoopState, Report
 from ne_dreamer_jax.runs import progress
+from ne_dreamer_jax.runs.building import Run
 from ne_dreamer_jax.runs.record import Record, last
-from ne_dreamer_jax.runs.run import Run
 from ne_dreamer_jax.runs.run_directory import RunDirectory, typed
 
 DIVERGED = 3
