@@ -6,11 +6,13 @@ of its own, and draws all of it into one figure.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import signal
 import statistics
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -57,10 +59,18 @@ class Asked(NamedTuple):
         """One run's settings. Raises ValueError where they do not fit together."""
         from experiments.train import configure
 
-        config = configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
-        if config.loop.eval_every is None:
-            raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
-        return config
+        return configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
+
+    def expect_evaluations(self, methods: Sequence[str]) -> None:
+        """Raises ValueError where a method's runs would have none."""
+        for method in methods:
+            with contextlib.suppress(ValueError):  # a method that does not fit is refused when its turn comes
+                if self.config(method, 0).loop.eval_every is not None:
+                    continue
+                break
+        else:
+            return
+        raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
 
 
 class Found(NamedTuple):
@@ -128,7 +138,7 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
       RefusedError, ValueError: as `finished`.
     """
     place = lambda method, seed: directory / method.replace("/", "-") / f"seed{seed}"
-    asked.config(methods[0], 0)
+    asked.expect_evaluations(methods)
     # All of them before the first one trains: a run of other settings is no part of this comparison.
     runs = [(method, seed) for seed in range(seeds) for method in methods]
     done = {run for run in runs if finished(place(*run), asked, *run)}
@@ -150,23 +160,31 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
 def train(path: Path, options: Sequence[str]) -> int:
     """One run, in a process of its own; its exit code, 128 + n where signal n ended it.
 
-    On Ctrl-C or SIGTERM the run saves itself, which is waited for. Raises SystemExit then.
+    On Ctrl-C or SIGTERM the run is told, too, and saves itself, which is waited for. Signals that are ignored stay so.
+
+    Raises:
+      SystemExit: there was such a signal.
     """
     arguments = [sys.executable, "-m", "ne_dreamer_jax", "train", *options, "--logdir", as_argument(path)]
     stopped: list[int] = []
-    with subprocess.Popen(arguments) as run:
+    run: subprocess.Popen[bytes] | None = None
 
-        def stop(signum: int, _: object) -> None:
-            stopped.append(signum)
-            if signum != signal.SIGINT:  # which a terminal sends to all of its processes
+    def stop(signum: int, _: object) -> None:
+        stopped.append(signum)
+        if run is not None:  # which takes it and a terminal's own, at the same time, for one
+            run.send_signal(signum)
+
+    in_main_thread = threading.current_thread() is threading.main_thread()  # no other hears of signals
+    heeded = [signum for signum in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(signum) != signal.SIG_IGN]
+    before = {signum: signal.signal(signum, stop) for signum in heeded if in_main_thread}
+    try:
+        with subprocess.Popen(arguments) as run:
+            for signum in stopped:
                 run.send_signal(signum)
-
-        before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}
-        try:
             code = run.wait()
-        finally:
-            for signum, handler in before.items():
-                signal.signal(signum, handler)
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
     if stopped:
         raise SystemExit(128 + stopped[0])
     return code if code >= 0 else 128 - code

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ne_dreamer_jax.config import Config
+    from ne_dreamer_jax.runs.building import Run
 
 SETTING = re.compile(r",(?=[\w.]+=)")
 """What parts a variant's settings: a comma before the next one's name, as values may hold commas, too."""
@@ -75,7 +76,7 @@ def main(
     if len(set(variants)) < len(variants):
         raise click.UsageError(f"expected variants that differ, got one twice: {' '.join(variants)}")
     common = (*(SMALL if small else ()), *assignments)
-    if any(setting.startswith("seed=") for text in (*common, *variants) for setting in SETTING.split(text)):
+    if any(re.match(r"seed\s*=", setting.strip()) for text in (*common, *variants) for setting in SETTING.split(text)):
         raise click.UsageError("seed: each variant has the seeds 0, 1, ..., of which --seeds says how many")
     with refusing(ValueError):
         made = {
@@ -118,10 +119,10 @@ def _locked(out: Path) -> Iterator[None]:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         lock = out.with_name(f".{out.name}.lock").open("a")
+        fcntl.flock(lock, fcntl.LOCK_EX)
     except OSError as error:
         raise ValueError(f"{out} can't be written: {error.strerror or error}") from error
     with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 
@@ -145,43 +146,53 @@ def train(
     Raises:
       ValueError: settings that do not fit each other, the environment or the memory.
     """
+    from ne_dreamer_jax.runs import building
+
+    began = time.monotonic()
+    run = building.build(config)
+    say("  Compiling, which takes a minute or more; then a line for each seed.")
+    repeat = config.env.action_repeat * config.loop.num_envs
+    interval, steps = max(1, (config.loop.eval_every or config.loop.env_steps) // repeat), run.loop.budget.vector_steps
+    ends = [*range(interval, steps, interval), steps]
+    curves: list[list[float]] = [] if before is None else list(before["curves"])
+    minutes = 0.0 if before is None else before["minutes"]
+    try:
+        for seed in seeds:
+            curves.append(_curve(run, seed, ends))
+            yield {
+                "task": config.env.task,
+                "variant": variant,
+                "seeds": seed + 1,
+                "env_steps": [end * repeat for end in ends],
+                "curves": list(curves),
+                "minutes": minutes + (time.monotonic() - began) / 60,
+                "config": plain(config),
+            }
+    finally:
+        if run.host is not None:
+            run.host.close()
+
+
+def _curve(run: Run, seed: int, ends: Sequence[int]) -> list[float]:
+    """The mean returns of a seed's policy after so many vector steps each."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     from experiments.probe_learning import EVALUATION
-    from ne_dreamer_jax.runs import building
 
-    began = time.monotonic()
-    run = building.build(config)
-    loop = run.loop
-    say("  Compiling, which takes a minute or more; then a line for each seed.")
-    repeat = config.env.action_repeat * config.loop.num_envs
-    interval = max(1, (config.loop.eval_every or config.loop.env_steps) // repeat)
-    ends = [*range(interval, loop.budget.vector_steps, interval), loop.budget.vector_steps]
-    curves: list[list[float]] = [] if before is None else list(before["curves"])
-    minutes = 0.0 if before is None else before["minutes"]
-    for seed in seeds:
-        state, curve, step, skipped = loop.init(jax.random.key(seed)), [], 0, 0.0
-        for end in ends:
-            state, report = loop.chunk(state, jnp.asarray(end - step, jnp.int32))
-            skipped += jax.device_get(report).means().get("skipped_updates", 0.0)
-            curve.append(float(np.mean(loop.evaluate(state.train.params, jax.random.key(EVALUATION)).returns)))
-            step = end
-        curves.append(curve)
-        if skipped:
-            say(f"  seed {seed}: {skipped:,.0f} of {loop.budget.updates:,} updates were not finite, and skipped.")
-        yield {
-            "task": config.env.task,
-            "variant": variant,
-            "seeds": seed + 1,
-            "env_steps": [end * repeat for end in ends],
-            "curves": list(curves),
-            "minutes": minutes + (time.monotonic() - began) / 60,
-            "config": plain(config),
-        }
-    if run.host is not None:
-        run.host.close()
+    loop, curve, step, skipped = run.loop, [], 0, 0.0
+    state = loop.init(jax.random.key(seed))
+    for end in ends:
+        state, report = loop.chunk(state, jnp.asarray(end - step, jnp.int32))
+        skipped += jax.device_get(report).means().get("skipped_updates", 0.0)
+        curve.append(float(np.mean(loop.evaluate(state.train.params, jax.random.key(EVALUATION)).returns)))
+        step = end
+    if run.release is not None:
+        run.release(state.env)
+    if skipped:
+        say(f"  seed {seed}: {skipped:,.0f} of {loop.budget.updates:,} updates were not finite, and skipped.")
+    return curve
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

@@ -333,9 +333,10 @@ def check(config: Config) -> None:
             f"{loop.replay_ratio:g} has it for batches of {agent.batch_size} x {agent.batch_length} steps, got "
             f"{agent.steps_per_update:g}; with loop.replay_ratio={ratio:g} it fits"
         )
-    if loop.prefill < (least := (agent.batch_length + 1) * loop.num_envs):
+    steps, least = -(-loop.prefill // loop.num_envs), agent.batch_length + 1
+    if steps < least and loop.replay_ratio:
         raise ValueError(
-            f"loop.prefill: expected at least {least:,}, {agent.batch_length + 1} steps of each of {loop.num_envs:,} "
+            f"loop.prefill: expected at least {least * loop.num_envs:,}, {least} steps of each of {loop.num_envs:,} "
             f"environments, before which there is nothing to learn from, got {loop.prefill:,}"
         )
     if agent.random_steps != loop.prefill:

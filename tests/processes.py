@@ -16,7 +16,7 @@ from pathlib import Path
 
 import jax
 
-from ne_dreamer_jax.runs import building, run_directory, training
+from ne_dreamer_jax.runs import building, run_directory, start, training
 from ne_dreamer_jax.system import parallel
 from tests.experiments import toy
 
@@ -30,6 +30,7 @@ def main(logdir: str, processes: str, process: str, port: str, stop_at: str = "n
         mesh = parallel.make_mesh(1)
     config = replace(toy.config(), seed=0 if seeds == "the same" else int(process))
     run = building.build(config, toy.env(), mesh)
+    start.check_processes(run.config, int(processes), None)
 
     def echo(line: str) -> None:
         print(line, flush=True)

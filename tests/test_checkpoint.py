@@ -257,5 +257,8 @@ def test_a_folder_that_cant_be_read_is_not_an_empty_one(tmp_path):
     (tmp_path / "checkpoints").write_text("no folder")
     with pytest.raises(checkpoint.DamagedError, match="checkpoints can't be read: Not a directory"):
         checkpoint.restore(tmp_path / "checkpoints", {"agent": make()})
+    (tmp_path / "link").symlink_to(tmp_path / "not mounted")
+    with pytest.raises(checkpoint.DamagedError, match="link can't be read: No such file or directory"):
+        checkpoint.restore(tmp_path / "link", {"agent": make()})
     with pytest.raises(FileNotFoundError):
         checkpoint.restore(tmp_path / "nothing", {"agent": make()})

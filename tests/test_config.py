@@ -157,6 +157,8 @@ def test_drqv2s_noise_keeps_step_with_the_loop():
     ):
         configs.check(many)
     configs.check(configs.override(many, "loop.prefill=5120"))
+    configs.check(configs.override(many, "loop.num_envs=499"))  # 2,000 steps begin the fifth of each
+    configs.check(configs.override(many, "loop.replay_ratio=0"))
     never = configs.with_method(configs.override(configs.preset("dmc"), "loop.replay_ratio=0"), "drqv2")
     assert (never.loop.replay_ratio, never.agent.steps_per_update) == (0, 2)
     configs.check(never)

@@ -133,6 +133,8 @@ def test_skipped_updates_are_counted_and_not_in_the_means():
         ),
         ({"is_terminal": np.zeros(6, bool)}, r"episode 1, is_terminal: expected one bool for the whole episode"),
         ({"is_terminal": 2}, r"episode 1, is_terminal: expected one bool for the whole episode, got 2"),
+        ({"is_terminal": [[1], [1, 2]]}, r"episode 1, is_terminal: expected one bool for the whole episode"),
+        ({"is_terminal": np.void(b"x")}, r"episode 1, is_terminal: expected one bool for the whole episode"),
         ({"is_terminal": "yes"}, r"episode 1, is_terminal: expected one bool for the whole episode, got yes"),
         ({"reward": np.full(6, np.nan)}, r"episode 1, reward: expected finite numbers, got nan"),
     ],
@@ -146,6 +148,11 @@ def test_what_does_not_fit_is_refused_with_its_place(changes, message):
 def test_an_end_may_be_a_number_as_in_data_sets(given):
     held = replay.from_episodes([episode(is_terminal=given), episode(is_terminal=bool(given))], SPEC, SIZES)
     assert int(np.sum(held.data.is_terminal)) == 2 * given
+
+
+def test_a_continuous_action_may_exceed_one_by_round_off():
+    held = replay.from_episodes([episode(action=np.full((6, 2), np.nextafter(1.0, 2.0)))], SPEC, SIZES)
+    assert np.max(held.data.action) == 1.0
 
 
 def test_a_discrete_action_that_would_wrap_round_is_refused():

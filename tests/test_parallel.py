@@ -123,7 +123,7 @@ def test_two_processes_train_as_one_does_and_one_goes_on_from_their_checkpoint(t
 def test_processes_with_other_settings_are_all_refused(tmp_path):
     code, ends = trained(tmp_path, 2, "never", "other seeds")
     assert code == 1
-    assert all("expected the same settings in all processes that train together" in err for _, err in ends)
+    assert all("expected the same options in all processes that train together" in err for _, err in ends)
 
 
 @pytest.mark.parametrize("changes", [{"num_envs": 3}, {"batch_size": 3}])

@@ -11,6 +11,7 @@ import sys
 
 import pytest
 
+from ne_dreamer_jax import config as configs
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.runs.run_directory import RefusedError
 
@@ -181,6 +182,13 @@ def test_a_directory_behind_a_link_is_a_directory(tmp_path):
     (tmp_path / "there").mkdir()
     run_directory.check(tmp_path / "link" / "run")
     run_directory.check(tmp_path / "link")
+
+
+def test_a_setting_that_is_infinite_is_read_back(tmp_path):
+    config = configs.override(configs.preset("smoke"), "agent.optimizer.agc=inf")
+    with run_directory.claim(tmp_path / "run", config):
+        pass
+    assert run_directory.read_config(tmp_path / "run", configs.Config) == config
 
 
 def test_results_that_are_not_finite_are_null(tmp_path):

@@ -181,7 +181,7 @@ class Group(NamedTuple):
 
 def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: float, group: Group) -> None:
     """Trains, and ends the program with the run's exit code."""
-    from ne_dreamer_jax.runs import building, checkpoint, progress, resume, training
+    from ne_dreamer_jax.runs import building, checkpoint, progress, resume, start, training
     from ne_dreamer_jax.runs import fork as forks
     from ne_dreamer_jax.system import compile_cache, parallel
 
@@ -199,6 +199,7 @@ def _train(config: Config, logdir: Path, fork: Path | None, checkpoint_minutes: 
         run = building.build(config, mesh=mesh)
         if fork is not None:
             forks.check_agent(fork, logdir, config, run.agent.spec, run.shapes.train)
+        start.check_processes(config, group.devices * group.processes, fork)
     for line in [*progress.describe(config, run.loop, run.shapes, changed), f"  compiled programs are kept in {kept}"]:
         echo(line)
     with refusing(run_directory.RefusedError, checkpoint.DamagedError), contextlib.ExitStack() as stack:

@@ -53,7 +53,7 @@ def categorical_kl(p_logits: jax.Array, q_logits: jax.Array) -> jax.Array:
     counts = possible & ~excluded  # 0 log 0 = 0, and so its gradients; NaN stays NaN
     ratio = jnp.where(counts, log_p, 0.0) - jnp.where(counts, log_q, 0.0)
     finite = jnp.sum(jnp.where(counts, jnp.exp(log_p) * ratio, 0.0), axis=-1)
-    return jnp.where(jnp.any(possible & excluded, axis=-1), jnp.inf, finite)
+    return jnp.where(jnp.any(possible & excluded, axis=-1), finite + jnp.inf, finite)
 
 
 def balanced_kl(

@@ -66,8 +66,12 @@ def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:
     """An episode's L + 1 steps, [L + 1, ...], without latents."""
     if not isinstance(episode, Episode):
         raise ValueError(f"episode {number}: expected replay.Episode, got {type(episode).__name__}")
-    terminal = np.asarray(episode.is_terminal)
-    if terminal.shape != () or terminal not in (False, True):  # 0 and 1 will do, as data sets have them
+    try:
+        terminal = np.asarray(episode.is_terminal)
+    except ValueError as error:
+        raise ValueError(f"episode {number}, is_terminal: expected one bool for the whole episode: {error}") from error
+    is_bool = terminal.shape == () and terminal.dtype.kind in "biuf" and terminal in (0, 1)  # as data sets have them
+    if not is_bool:
         raise ValueError(
             f"episode {number}, is_terminal: expected one bool for the whole episode, got "
             + (f"{terminal}" if terminal.shape == () else f"the shape {list(terminal.shape)}")
@@ -83,8 +87,10 @@ def _rows(number: int, episode: Episode, spec: EnvSpec) -> Transition:
     obs = {}
     for name, s in spec.observation.items():
         obs[name] = _expect(number, f"obs[{name!r}]", np.asarray(episode.obs[name]), (length + 1, *s.shape), s.dtype)
-    _expect_range(number, np.asarray(episode.action), spec)  # before a cast, which would wrap round
+    if not isinstance(spec.action, ContinuousAction):
+        _expect_range(number, np.asarray(episode.action), spec)  # before the cast, in which large numbers wrap round
     action = np.asarray(episode.action, spec.action.dtype)
+    _expect_range(number, action, spec)  # after it, which rounds to 1 what is above it by an error of arithmetic
     steps = np.arange(length + 1)
     flags = {"is_first": steps == 0, "is_last": steps == length, "is_terminal": (steps == length) & bool(terminal)}
     return Transition(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jax.sharding import Mesh
 
 from ne_dreamer_jax.config import Config
-from ne_dreamer_jax.runs import building, progress, resume, run_directory, training
+from ne_dreamer_jax.runs import building, progress, resume, run_directory, start, training
 from ne_dreamer_jax.runs import fork as forks
 from ne_dreamer_jax.runs.run_directory import RunDirectory
 from ne_dreamer_jax.system import compile_cache
@@ -73,6 +73,7 @@ def train(
     run = building.build(config, env, mesh)
     if parent is not None:
         forks.check_agent(parent, path, config, run.agent.spec, run.shapes.train)
+    start.check_processes(config, 1 if mesh is None else mesh.size, parent)
     for line in progress.describe(config, run.loop, run.shapes, changed):
         echo(line)
     with run_directory.claim(path, config, resume.differences) as files:

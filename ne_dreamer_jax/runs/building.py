@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
 
@@ -28,6 +29,7 @@ class Run(NamedTuple):
     shapes: LoopState  # shapes and dtypes of the whole state
     step_seconds: float | None = None  # simulated time of an agent step
     host: Host | None = None  # where the environments are, if they are not in the program
+    release: Callable[[Any], None] | None = None  # of environments' states that are stepped no more, as of `VectorEnv`
 
     @property
     def schedule(self) -> Schedule:
@@ -61,5 +63,5 @@ def build(config: Config, env: Env | VectorEnv | None = None, mesh: Mesh | None 
     check_env(env)
     agent = make_agent(config.agent, env.spec)
     loop = loops.make(config.loop, env, agent, config.env.action_repeat, mesh)
-    host = env.host if isinstance(env, VectorEnv) else None
-    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds, host)
+    host, release = (env.host, env.release) if isinstance(env, VectorEnv) else (None, None)
+    return Run(config, agent, loop, loop.state_shapes(), env.step_seconds, host, release)

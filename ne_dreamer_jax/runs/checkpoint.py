@@ -250,9 +250,10 @@ def _find(directory: Path) -> tuple[list[Checkpoint], list[str]]:
     found, damaged = [], []
     try:
         paths = list(directory.iterdir())
-    except FileNotFoundError:
-        return [], []
-    except OSError as error:  # not to be taken for a directory without checkpoints
+    except OSError as error:
+        if not os.path.lexists(directory):
+            return [], []
+        # Not to be taken for a folder without checkpoints; a link whose target is not there (yet) isn't one either.
         return [], [f"{directory} can't be read: {error.strerror or error}."]
     places = {path.name.removeprefix(_REPLACED): path for path in paths if path.name.startswith(_REPLACED)}
     places |= {path.name: path for path in paths if path.name.isdigit()}

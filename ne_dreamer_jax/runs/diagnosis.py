@@ -77,7 +77,8 @@ def diagnose(
     for what, (number, bound) in least.items():
         if number < bound:
             raise ValueError(f"{what}: expected {bound} or more, got {number}")
-    loaded = evaluation.load(run, env, prefer)
+    path = Path(run).expanduser()
+    loaded = evaluation.load(path, env, prefer)
     agent, params = loaded.agent, loaded.state.params
     if agent.inspection is None:
         raise ValueError(f"{run}: expected a run of an agent with a world model, got {agent.config.method}")
@@ -96,7 +97,7 @@ def diagnose(
         mode = np.asarray(agent.heads(params, jnp.asarray(probing.features(held_out))).action)
         told["saturated"] = probing.saturated(mode)
         echo(f"Policy: at an end of tanh in a share of steps, by component: {_round(told['saturated'])}")
-    files = RunDirectory(Path(run))
+    files = RunDirectory(path)
     run_directory.write_diagnosis(files, told)  # whatever becomes of the decoder
     name = _image(agent, spec, echo) if decoder_updates else None
     if name is not None:

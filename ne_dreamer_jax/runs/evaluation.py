@@ -98,12 +98,13 @@ def evaluate(
       ValueError: as `load`; or the other environment is observed or acted in otherwise; or environments in worker
         processes fail.
     """
-    loaded = load(run, env, prefer)
+    path = Path(run).expanduser()
+    loaded = load(path, env, prefer)
     if with_video and env is None:
         loaded = in_env(loaded, env_configs.with_images(loaded.config.env))  # the agent does not see them
     with opened(loaded.env) as venv, contextlib.ExitStack() as stack:
         other = None if also is None else stack.enter_context(opened(_other(also, loaded)))
-        return _evaluate(Path(run), loaded, venv, other, also, episodes, seed, with_video, echo)
+        return _evaluate(path, loaded, venv, other, also, episodes, seed, with_video, echo)
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@
 ``config.json``        the configuration, whole, and its checksum
 ``parent.json``        of a run that began with another's agent: which, see `ne_dreamer_jax.runs.fork`
 ``metrics.jsonl``      see `ne_dreamer_jax.metrics`
+``metrics-earlier-N``  ``.jsonl``: those of starts that left no checkpoint to go on from
 ``checkpoints/``       see `ne_dreamer_jax.checkpoint`
 ``evaluation.json``    what the last evaluation found
 ``diagnosis.json``     what the last diagnosis found
@@ -23,6 +24,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -66,8 +68,9 @@ class RunDirectory(NamedTuple):
 
     @property
     def earlier_metrics(self) -> Path:
-        """Metrics of starts that left no checkpoint to go on from."""
-        return self.path / "metrics-earlier.jsonl"
+        """A name that is free for the metrics of a start that left no checkpoint to go on from."""
+        paths = (self.path / f"metrics-earlier-{number}.jsonl" for number in itertools.count(1))
+        return next(path for path in paths if not path.exists())
 
     @property
     def checkpoints(self) -> Path:
@@ -263,13 +266,13 @@ def write_diagnosis(files: RunDirectory, result: Mapping[str, Any]) -> None:
 
 def _write_result(path: Path, result: Mapping[str, Any]) -> None:
     try:
-        _write_json(path, result)
+        _write_json(path, _finite(result))
     except OSError as error:
         raise RefusedError(f"{path} can't be written: {error.strerror or error}") from error
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", sync=True)
+    write_text(path, json.dumps(content, indent=2) + "\n", sync=True)
 
 
 def _finite(content: Any) -> Any:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import time
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,15 +92,9 @@ def _take_out(restored: checkpoint.Restored) -> None:
 def _set_aside(files: RunDirectory, echo: Echo) -> None:
     """Keeps the metrics of a run that begins anew, as its checkpoints are gone, or were never written."""
     try:
-        if metrics.read(files.metrics):
-            whole, _, _ = files.metrics.read_bytes().rpartition(b"\n")
-            with files.earlier_metrics.open("ab") as file:
-                file.write(whole + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-            echo(f"There is no checkpoint: beginning anew. The metrics so far are in {files.earlier_metrics}.")
-    except ValueError as error:
-        raise run_directory.RefusedError(str(error)) from error
+        if files.metrics.exists() and files.metrics.stat().st_size:
+            kept = files.metrics.rename(files.earlier_metrics)
+            echo(f"There is no checkpoint: beginning anew. The metrics so far are in {kept}.")
     except OSError as error:
         raise run_directory.RefusedError(f"{files.metrics} can't be kept: {error.strerror or error}") from error
 
@@ -142,18 +134,25 @@ def space(run: Run, files: RunDirectory) -> str:
     )
 
 
-def check_settings(config: Config) -> None:
-    """Raises RefusedError where processes that train together have other settings."""
-    text = json.dumps(settings.to_dict(config), sort_keys=True)
-    if not parallel.same(zlib.crc32(text.encode()) >> 1):
+def check_processes(config: Config, devices: int, parent: Path | None) -> None:
+    """Refuses processes that train together under different options; all call it, before one claims a directory.
+
+    Args:
+      devices: how many there are, of all processes.
+      parent: as of `first_state`.
+
+    Raises:
+      RefusedError: in each of them, if one has others.
+    """
+    options = [settings.to_dict(config), devices, parent and str(parent.resolve())]
+    if not parallel.same(json.dumps(options, sort_keys=True)):
         raise run_directory.RefusedError(
-            f"expected the same settings in all processes that train together, got others in process "
-            f"{jax.process_index()} than elsewhere; give each of them the same options"
+            "expected the same options in all processes that train together, got others in at least one of them"
         )
 
 
 def _same_for_all(files: RunDirectory, env_step: int) -> None:
-    if not parallel.same(env_step + 1):
+    if not parallel.same(str(env_step)):
         raise run_directory.RefusedError(
             f"expected all processes to find the same checkpoints, got others in {files.checkpoints} of process "
             f"{jax.process_index()}; put --logdir where all of them see it"

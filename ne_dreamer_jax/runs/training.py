@@ -79,7 +79,6 @@ def train(
 
 
 def _train(run: Run, files: RunDirectory, checkpoint_minutes: float, echo: Echo, parent: Path | None) -> int:
-    start.check_settings(run.config)
     is_main_process = parallel.is_main_process()
     if is_main_process and run.config.env.task == GIVEN:
         run_directory.store_config(files, run.config)  # which says that the environment was given in code

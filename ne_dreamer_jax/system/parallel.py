@@ -8,6 +8,7 @@ floats are added.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -138,11 +139,12 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
-def same(number: int) -> bool:
-    """Whether all processes hold the same number, below 2**31 - 1; all must call it, and all get the same answer."""
+def same(text: str) -> bool:
+    """Whether all processes hold the same text, by its checksum; all must call it, and all get the same answer."""
     if jax.process_count() == 1:
         return True
-    everyone = np.asarray(multihost_utils.process_allgather(np.asarray(number, np.int32)))
+    checksum = np.asarray(zlib.crc32(text.encode()), np.uint32)
+    everyone = np.asarray(multihost_utils.process_allgather(checksum))
     return bool((everyone == everyone.flat[0]).all())
 
 

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from experiments import switches
+from ne_dreamer_jax.system import memory
 
 VARIANTS = ["agent.behavior.lam=0.95", "agent.behavior.lam=0.9,agent.behavior.horizon=5"]
 RETURNS = {VARIANTS[0]: [[1.0, 10.0], [2.0, 12.0], [0.0, 11.0]], VARIANTS[1]: [[5.0, 20.0], [4.0, 24.0], [6.0, 22.0]]}
@@ -111,7 +112,7 @@ def test_an_interval_holds_the_difference_that_there_is():
         ([], "Missing argument"),
         ([VARIANTS[0], VARIANTS[0]], "expected variants that differ"),
         (["agent.behavior.lam=0.9,seed=1"], "of which --seeds says how many"),
-        ([VARIANTS[0], "--set", "seed=1"], "of which --seeds says how many"),
+        ([VARIANTS[0], "--set", "seed =1"], "of which --seeds says how many"),
     ],
 )
 def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, message):
@@ -121,7 +122,8 @@ def test_what_does_not_fit_is_said_before_anything_trains(invoke, arguments, mes
     assert trained == []
 
 
-def test_what_does_not_fit_into_memory_is_refused(tmp_path):
+def test_what_does_not_fit_into_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available", lambda: 10**9)
     out = str(tmp_path / "out.jsonl")
     options = ["--small", "--obs", "vector", "--set", "loop.env_steps=1e12", "--set", "loop.capacity=2e9"]
     done = CliRunner().invoke(switches.main, [out, VARIANTS[0], *options])

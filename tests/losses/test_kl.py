@@ -55,6 +55,7 @@ def test_a_class_that_is_masked_adds_nothing_to_the_divergence_nor_to_its_gradie
     assert categorical_kl(jnp.asarray([0.0, 0.0, -200.0]), q) == jnp.inf, "however improbable"
     for broken in (jnp.nan, jnp.inf):
         assert jnp.isnan(categorical_kl(jnp.asarray([broken, 0.0, 1.0]), jnp.zeros(3)))
+        assert jnp.isnan(categorical_kl(jnp.asarray([broken, 0.0, 1.0]), q))
 
 
 @pytest.mark.parametrize("unimix", [0.0, 0.01])
