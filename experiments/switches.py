@@ -1,7 +1,7 @@
 """What a setting is worth: variants of one configuration, several seeds each, and the interval of their difference.
 
-A variant is one or more settings, joined by commas; the first is what the others are compared with. Its seeds train one
-after the other, in one compiled program.
+A variant is one or more settings, joined by commas, or ``default``; the first is what the others are compared with. Its
+seeds train one after the other, in one compiled program.
 
 Usage: ``python -m experiments.switches runs/head.jsonl agent.behavior.discount_in_head=true
 agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 SETTING = re.compile(r",(?=[\w.]+=)")
 """What parts a variant's settings: a comma before the next one's name, as values may hold commas, too."""
+DEFAULT = "default"
+"""The variant that changes nothing."""
 SMALL = (
     "agent.rssm.deter=128",
     "agent.rssm.hidden=64",
@@ -76,12 +78,12 @@ def main(
     if len(set(variants)) < len(variants):
         raise click.UsageError(f"expected variants that differ, got one twice: {' '.join(variants)}")
     common = (*(SMALL if small else ()), *assignments)
-    if any(re.match(r"seed\s*=", setting.strip()) for text in (*common, *variants) for setting in SETTING.split(text)):
+    if any(re.match(r"seed\s*=", setting.strip()) for text in (*common, *variants) for setting in _settings(text)):
         raise click.UsageError("seed: each variant has the seeds 0, 1, ..., of which --seeds says how many")
     with refusing(ValueError):
         made = {
             (task, variant): configure(
-                preset, None, method, {"env.task": task, "env.obs": obs}, (*common, *SETTING.split(variant))
+                preset, None, method, {"env.task": task, "env.obs": obs}, (*common, *_settings(variant))
             )
             for task in tasks or (None,)
             for variant in variants
@@ -93,6 +95,11 @@ def main(
     say("")
     for row in table(compared):
         say(row)
+
+
+def _settings(variant: str) -> tuple[str, ...]:
+    """The assignments that a variant is made of."""
+    return () if variant == DEFAULT else tuple(SETTING.split(variant))
 
 
 def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, Any]:

@@ -47,6 +47,10 @@ class Checkpoint(NamedTuple):
     items: dict[str, arrays.Described]  # item -> its arrays
     files: dict[str, arrays.Files]  # item -> the files in its folder
 
+    def __repr__(self) -> str:
+        items = {item: len(leaves) for item, leaves in self.items.items()}
+        return f"Checkpoint({str(self.path)!r}, step={self.step}, score={self.score}, arrays={items})"
+
 
 class SaveError(Exception):
     """A checkpoint could not be written; the message names the path and the cause."""

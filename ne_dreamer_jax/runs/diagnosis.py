@@ -143,7 +143,7 @@ def _models(
         probe = probing.LinearProbe.fit(probing.features(fit), probing.side_by_side(fit.obs, vectors)[1][fit.counts])
         known = probe.explained(probing.features(held_out), truth[held_out.counts])
         told["known"] = dict(zip(names, known, strict=True))
-        echo("Known by the latent: " + shares(told["known"]))
+        echo("Known by the latent (of the variance; below 0: worse than the mean): " + shares(told["known"]))
     predicted = probing.open_loops(agent, params, key, held_out, probe, truth, horizon)
     told["open_loop"] = {h: ahead._asdict() for h, ahead in predicted.items()}
     for h, ahead in predicted.items():

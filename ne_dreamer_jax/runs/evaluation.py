@@ -194,7 +194,8 @@ def head(loaded: Loaded, episodes: int, seed: int, echo: Callable[[str], None]) 
     for reason in loaded.skipped:
         echo(f"Passed over a damaged checkpoint: {reason}")
     config, found = loaded.config, loaded.checkpoint
-    echo(f"{config.env.task}, {config.method}, after {found.step:,} environment steps ({found.path})")
+    scored = "" if found.score is None else f", where its evaluation returned {found.score:.1f}"
+    echo(f"{config.env.task}, {config.method}, after {found.step:,} environment steps{scored} ({found.path})")
     return {"task": config.env.task, "env_step": found.step, "episodes": episodes, "seed": seed}
 
 

@@ -167,8 +167,8 @@ def check_same(path: Path, config: Any, differences: Differences = settings.diff
     if different:
         raise RefusedError(
             f"{path} holds another run, or one with other settings. Give it the same options to go on, choose another "
-            f"--logdir, or begin a new run in another directory from this one's agent with --fork {typed(path)}. They "
-            "differ in\n  " + "\n  ".join(different)
+            f"directory, or begin a new run in another one from its agent with --fork {typed(path)}. They differ "
+            "in\n  " + "\n  ".join(different)
         )
 
 

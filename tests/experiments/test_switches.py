@@ -58,6 +58,14 @@ def test_variants_are_trained_once_and_compared(invoke, tmp_path):
     assert VARIANTS[0] not in output
 
 
+def test_a_variant_may_be_the_preset_itself(invoke, monkeypatch):
+    monkeypatch.setitem(RETURNS, "default", RETURNS[VARIANTS[0]])
+    code, output, trained = invoke("default", VARIANTS[1], "--seeds", "3", "--task", "dmc/cartpole_swingup")
+    assert code == 0, output
+    assert [horizon for _, _, horizon in trained] == [10, 5]
+    assert "| `default` | 10 12 11 |" in output
+
+
 def test_seeds_that_are_there_are_kept_whatever_ends_the_command(invoke, tmp_path):
     invoke.stopping_at[VARIANTS[0]] = 1
     code, _, _ = invoke(VARIANTS[0], "--seeds", "3")

@@ -17,8 +17,16 @@ from typing import Any
 import click
 import jax
 import numpy as np
-import torch
-from torch import distributions as torchd
+
+try:
+    import torch
+    from torch import distributions as torchd
+except ModuleNotFoundError:
+    print(
+        "The authors' code needs PyTorch: pip install torch==2.8.0 torchrl==0.9.2 tensordict==0.9.1 einops",
+        file=sys.stderr,
+    )
+    raise SystemExit(2) from None
 
 from ne_dreamer_jax import make_agent
 from ne_dreamer_jax.agents.dreamer.agent import AgentConfig

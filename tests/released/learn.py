@@ -27,7 +27,6 @@ from typing import Any
 
 import click
 import numpy as np
-import torch
 
 from ne_dreamer_jax import settings
 from ne_dreamer_jax.agents.dreamer.agent import AgentConfig
@@ -40,6 +39,7 @@ from ne_dreamer_jax.loop.budget import Budget
 from ne_dreamer_jax.objectives import NextEmbedding
 from ne_dreamer_jax.runs import metrics
 from tests.released import compare, curves
+from tests.released.compare import torch
 
 METHOD = "ne_dreamer"
 SMALL = (
