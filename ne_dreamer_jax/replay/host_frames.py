@@ -76,7 +76,6 @@ class HostFrames:
 
     def put(self, name: str, tickets: Array, images: Array) -> Array:
         """Stores images ``[n, ...]`` under tickets int32 [n], and returns the tickets once they are stored."""
-
         shape = images.shape
 
         def store(tickets: Any, images: Any) -> np.ndarray:
@@ -90,13 +89,13 @@ class HostFrames:
 
     def get(self, name: str, tickets: Array) -> Array:
         """The images ``[..., H, W, C]`` of tickets int32 [...]."""
+        lead, stored = tickets.shape, self._shapes[name]
 
         def fetch(pieces: Any) -> np.ndarray:
-            row, env = np.divmod(_joined(pieces).reshape(tickets.shape), self.envs)
+            row, env = np.divmod(_joined(pieces).reshape(lead), self.envs)
             return self.arrays[name][row, env]
 
-        shape, dtype = self._shapes[name].shape, self._shapes[name].dtype
-        return io_callback(fetch, jax.ShapeDtypeStruct((*tickets.shape, *shape[2:]), dtype), _pieces(tickets))
+        return io_callback(fetch, jax.ShapeDtypeStruct((*lead, *stored.shape[2:]), stored.dtype), _pieces(tickets))
 
 
 def _pieces(x: Array) -> list[Array]:
