@@ -15,10 +15,11 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from experiments.common import Common, common
 from ne_dreamer_jax.commands.options import Name, Task, UserPath, refusing, say
 from ne_dreamer_jax.runs import run_directory
 from ne_dreamer_jax.runs.run_directory import as_argument
@@ -36,41 +37,6 @@ LABELS = {"dreamerv3": "DreamerV3", "drqv2": "DrQ-v2"}
 
 REFUSED = 2
 """Exit code of a command whose arguments do not fit, such as a method that can't act in the task."""
-
-
-class Asked(NamedTuple):
-    """What all runs have in common: options of `experiments.train`."""
-
-    preset: str
-    size: str | None
-    task: str | None
-    assignments: Sequence[str]
-
-    def options(self, method: str, seed: int) -> list[str]:
-        """One run's, as they are typed."""
-        options = ["--preset", self.preset]
-        for option, value in (("--task", self.task), ("--size", self.size)):
-            options += [] if value is None else [option, value]
-        for assignment in self.assignments:
-            options += ["--set", assignment]
-        return [*options, "--method", method, "--seed", str(seed)]
-
-    def config(self, method: str, seed: int) -> Config:
-        """One run's settings. Raises ValueError where they do not fit together."""
-        from experiments.train import configure
-
-        return configure(self.preset, self.size, method, {"env.task": self.task, "seed": seed}, self.assignments)
-
-    def expect_evaluations(self, methods: Sequence[str]) -> None:
-        """Raises ValueError where a method's runs would have none."""
-        for method in methods:
-            with contextlib.suppress(ValueError):  # a method that does not fit is refused when its turn comes
-                if self.config(method, 0).loop.eval_every is not None:
-                    continue
-                break
-        else:
-            return
-        raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
 
 
 class Found(NamedTuple):
@@ -95,24 +61,19 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
         help=f"May be repeated. Default: {', '.join(methods)}.",
     )
     @click.option("--seeds", type=click.IntRange(1), default=2, show_default=True, help="Runs of each method.")
-    @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart", show_default=True)
-    @click.option("--size", type=Name("size", names.SIZES), help="Parameters, roughly; drqv2 has one size.")
-    @click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As for experiments.train.")
+    @common("quickstart")
     @click.option("--draw", "only_draw", is_flag=True, help="Train nothing; draw the runs that are there.")
     def main(
         directory: Path,
         task: str | None,
         chosen: tuple[str, ...],
         seeds: int,
-        preset: str,
-        size: str | None,
-        assignments: tuple[str, ...],
         only_draw: bool,
+        **settings: Any,
     ) -> None:
         quiet()
         with refusing(run_directory.RefusedError, ValueError):
-            asked = Asked(preset, size, task, assignments)
-            failed = {} if only_draw else train_missing(directory, chosen or methods, seeds, asked)
+            failed = {} if only_draw else train_missing(directory, task, chosen or methods, seeds, Common(**settings))
             found = find(directory)
             for line in draw(found, directory / "comparison.png"):
                 say(line)
@@ -125,7 +86,9 @@ def command(methods: Sequence[str], help_text: str) -> click.Command:
     return main
 
 
-def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: Asked) -> dict[tuple[str, int], int]:
+def train_missing(
+    directory: Path, task: str | None, methods: Sequence[str], seeds: int, settings: Common
+) -> dict[tuple[str, int], int]:
     """Trains what is not finished yet, and goes on where a run fails.
 
     A method that can't act in the task is refused once, not for every seed.
@@ -138,10 +101,10 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
       RefusedError, ValueError: as `finished`.
     """
     place = lambda method, seed: directory / method.replace("/", "-") / f"seed{seed}"
-    asked.expect_evaluations(methods)
+    expect_evaluations(settings, task, methods)
     # All of them before the first one trains: a run of other settings is no part of this comparison.
     runs = [(method, seed) for seed in range(seeds) for method in methods]
-    done = {run for run in runs if finished(place(*run), asked, *run)}
+    done = {run for run in runs if finished(place(*run), settings, task, *run)}
     failed: dict[tuple[str, int], int] = {}
     for seed in range(seeds):  # by seed first: all methods are there to be compared as early as can be
         for method in methods:
@@ -149,12 +112,24 @@ def train_missing(directory: Path, methods: Sequence[str], seeds: int, asked: As
             if failed.get((method, 0)) == REFUSED or (method, seed) in done:
                 continue
             say(f"\n{method}, seed {seed}: {path}")
-            code = train(path, asked.options(method, seed))
+            code = train(path, settings.options(task, method, seed))
             if code in (128 + signal.SIGINT, 128 + signal.SIGTERM):  # somebody stopped the run, and so all of this
                 raise SystemExit(code)
             if code:
                 failed[method, seed] = code
     return failed
+
+
+def expect_evaluations(settings: Common, task: str | None, methods: Sequence[str]) -> None:
+    """Raises ValueError where a method's runs would have none."""
+    for method in methods:
+        with contextlib.suppress(ValueError):  # a method that does not fit is refused when its turn comes
+            if settings.config(task, method, 0).loop.eval_every is not None:
+                continue
+            break
+    else:
+        return
+    raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
 
 
 def train(path: Path, options: Sequence[str]) -> int:
@@ -190,7 +165,7 @@ def train(path: Path, options: Sequence[str]) -> int:
     return code if code >= 0 else 128 - code
 
 
-def finished(path: Path, asked: Asked, method: str, seed: int) -> bool:
+def finished(path: Path, settings: Common, task: str | None, method: str, seed: int) -> bool:
     """Whether a run has had the last evaluation that is asked for.
 
     Raises:
@@ -202,7 +177,7 @@ def finished(path: Path, asked: Asked, method: str, seed: int) -> bool:
         return False
     from ne_dreamer_jax.runs import metrics, resume
 
-    budget = resume.settle(path, asked.config(method, seed)).loop.env_steps
+    budget = resume.settle(path, settings.config(task, method, seed)).loop.env_steps
     return any("eval/return" in line and line["env_step"] >= budget for line in metrics.read(files.metrics))
 
 

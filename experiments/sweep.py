@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import click
 
+from experiments.common import Common, common
 from ne_dreamer_jax.commands.options import Name, Task, UserPath, say
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
@@ -78,9 +79,7 @@ class Job:
     help="May be repeated.",
 )
 @click.option("--seeds", type=click.IntRange(1), metavar="N", default=3, show_default=True, help="Seeds 0 to N - 1.")
-@click.option("--preset", type=Name("preset", names.PRESETS), default="dmc", show_default=True)
-@click.option("--size", type=Name("size", names.SIZES), help="Default: the preset's own.")
-@click.option("--set", "assignments", metavar="PATH=VALUE", multiple=True, help="As of experiments.train.")
+@common("dmc")
 @click.option("--logdir", type=UserPath(), metavar="DIRECTORY", required=True, help="Runs are kept below.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Runs at a time.")
 @click.option("--slurm", is_flag=True, help="Submit SLURM jobs, instead of processes of this machine.")
@@ -92,9 +91,6 @@ def main(
     tasks: tuple[str, ...],
     methods: tuple[str, ...],
     seeds: int,
-    preset: str,
-    size: str | None,
-    assignments: tuple[str, ...],
     logdir: Path,
     jobs: int,
     slurm: bool,
@@ -102,6 +98,7 @@ def main(
     gpus: int,
     hours: int,
     dry_run: bool,
+    **settings: Any,
 ) -> None:
     """Train every task with every method and seed.
 
@@ -114,7 +111,7 @@ def main(
     """
     if partition is not None and not slurm:
         raise click.UsageError("expected --partition together with --slurm")
-    runs = plan(tasks, methods, range(seeds), preset, size, assignments, logdir)
+    runs = plan(tasks, methods, range(seeds), Common(**settings), logdir)
     if dry_run:
         for run in runs:
             say(shlex.join(run.command))
@@ -135,22 +132,14 @@ def main(
 
 
 def plan(
-    tasks: Sequence[str],
-    methods: Sequence[str],
-    seeds: Sequence[int],
-    preset: str,
-    size: str | None,
-    assignments: Sequence[str],
-    logdir: Path,
+    tasks: Sequence[str], methods: Sequence[str], seeds: Sequence[int], settings: Common, logdir: Path
 ) -> list[Run]:
     """All runs of a sweep, seed by seed, so that what comes first covers all tasks and methods."""
-    shared = ["--preset", preset, *(["--size", size] if size else [])]
-    shared += [word for assignment in assignments for word in ("--set", assignment)]
     runs = []
     for seed, task, method in itertools.product(seeds, dict.fromkeys(tasks), dict.fromkeys(methods)):
         folder = logdir / task.replace("/", "_") / method.replace("/", "_") / f"seed{seed}"
-        own = ["--task", task, "--method", method, "--seed", str(seed), "--logdir", as_argument(folder)]
-        command = (sys.executable, "-m", "ne_dreamer_jax", "train", *shared, *own)
+        options = [*settings.options(task, method, seed), "--logdir", as_argument(folder)]
+        command = (sys.executable, "-m", "ne_dreamer_jax", "train", *options)
         runs.append(Run(f"{task} {method} seed {seed}", folder, command))
     return runs
 

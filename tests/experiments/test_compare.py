@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from experiments import ablations, compare
+from experiments.common import Common
 from experiments.train import configure
 from ne_dreamer_jax.runs import metrics, plots, run_directory
 from ne_dreamer_jax.runs.metrics import StepCounts
@@ -83,6 +84,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, invoke):
     ("options", "message"),
     [
         (["--task", "dmc/cheetah_run"], "env.task: 'dmc/ball_in_cup_catch', now 'dmc/cheetah_run'"),
+        (["--obs", "vector"], "env.obs: 'pixels', now 'vector'"),
         (["--set", "agent.optimizer.learning_rate=0.5"], "agent.optimizer.learning_rate"),
     ],
 )
@@ -103,10 +105,10 @@ def test_no_run_begins_where_another_is_of_other_settings(tmp_path, invoke):
 
 def test_a_finished_run_that_is_to_have_more_steps_goes_on(tmp_path, invoke):
     invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)
-    asked = compare.Asked("quickstart", None, None, [f"loop.env_steps={2 * BUDGET}"])
+    settings = Common("quickstart", assignments=[f"loop.env_steps={2 * BUDGET}"])
     run = tmp_path / "r2dreamer" / "seed0"
-    assert not compare.finished(run, asked, "r2dreamer", 0)
-    assert compare.finished(run, asked._replace(assignments=[f"loop.env_steps={BUDGET}"]), "r2dreamer", 0)
+    assert not compare.finished(run, settings, None, "r2dreamer", 0)
+    assert compare.finished(run, settings._replace(assignments=[f"loop.env_steps={BUDGET}"]), None, "r2dreamer", 0)
 
 
 @pytest.mark.parametrize("name", ["config.json", "metrics.jsonl"])

@@ -24,7 +24,8 @@ def invoke(*arguments):
 def test_every_run_has_its_command_and_its_directory(tmp_path):
     code, output = invoke(
         "--task", "dmc/walker_walk", "--task", "dmc/cheetah_run", "--method", "ne_dreamer/no_shift", "--seeds", 3,
-        "--size", "1m", "--set", "loop.num_envs=4", "--set", "agent.batch_size=8", "--logdir", tmp_path, "--dry-run",
+        "--size", "1m", "--obs", "vector", "--set", "loop.num_envs=4", "--set", "agent.batch_size=8",
+        "--logdir", tmp_path, "--dry-run",
     )  # fmt: skip
     assert code == 0
     assert not list(tmp_path.iterdir())
@@ -34,7 +35,8 @@ def test_every_run_has_its_command_and_its_directory(tmp_path):
     for command in commands:
         assert command[:4] == [sys.executable, "-m", "ne_dreamer_jax", "train"]
         options = train.main.make_context("train", command[4:]).params
-        assert (options["size"], options["preset"], options["method"]) == ("1m", "dmc", "ne_dreamer/no_shift")
+        chosen = {"size": "1m", "preset": "dmc", "method": "ne_dreamer/no_shift", "obs": "vector"}
+        assert {name: options[name] for name in chosen} == chosen
         assert options["assignments"] == ("loop.num_envs=4", "agent.batch_size=8")
         got.add((options["task"], options["seed"], options["logdir"]))
     assert {(task, seed) for task, seed, _ in got} == {
