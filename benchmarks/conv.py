@@ -1,6 +1,6 @@
 """The image encoder forward and forward with gradient, stage by stage and whole, beside XLA's own convolutions.
 
-``python -m benchmarks.conv --size 12m --images 1024``. On a CPU ``ours`` is `nets.cpu_conv`; on an accelerator both are
+``python -m benchmarks.conv --size 12m --images 1024``. On a CPU ``ours`` is `nets.cpu.conv`; on an accelerator both are
 the same code. GEMM units are those of the images asked for.
 """
 

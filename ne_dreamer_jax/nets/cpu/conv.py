@@ -126,7 +126,7 @@ class _Phases:
 
     @staticmethod
     def bytes_per_image(shape: tuple[int, ...], kernel: Array) -> int:
-        return shape[1] * shape[2] * max(9 * kernel.shape[2], 4 * kernel.shape[3])
+        return shape[1] * shape[2] * max(36 * kernel.shape[2], 4 * kernel.shape[3])
 
     @classmethod
     def prepare(cls, kernel: Array) -> Array:
