@@ -25,6 +25,7 @@ from ne_dreamer_jax.runs import checkpoint
 from ne_dreamer_jax.system import parallel
 from ne_dreamer_jax.types import ArraySpec
 from tests import counting, tiny
+from tests.drqv2 import small
 
 N, B, STEPS = 16, 8, 20
 CONFIG = LoopConfig(
@@ -163,14 +164,28 @@ def whole_agent() -> dict[str, Any]:
     return out
 
 
+def model_free() -> list[dict[str, float]]:
+    """DrQ-v2's losses, whose policy state has a count that all environments share, on 1 and on 8 devices."""
+    env = counting.env(image=False)
+    config = dataclasses.replace(small.CONFIG, batch_size=B, random_steps=4 * N)
+    agent, out = agents.make_agent(config, env.spec), []
+    for devices in (1, 8):
+        mesh = None if devices == 1 else parallel.make_mesh(devices)
+        changed = dataclasses.replace(CONFIG, replay_ratio=1.0, prefill=4 * N, write_latents=False)
+        loop = loops.make(changed, env, agent, 1, mesh)
+        state, report = loop.chunk(loop.init(jax.random.key(0)), np.asarray(STEPS, np.int32))
+        assert mesh is None or placed(loop, state)
+        out.append({**jax.device_get(report).means(), "policy steps": int(state.policy.step)})
+    return out
+
+
 def main(*names: str) -> None:
     """Computes the parts of these names."""
     jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    parts = {
-        part.__name__: part for part in (environments_and_replay, images_on_the_host, collectives, moved, whole_agent)
-    }
+    all_parts = (environments_and_replay, images_on_the_host, collectives, moved, model_free, whole_agent)
+    parts = {part.__name__: part for part in all_parts}
     print(json.dumps({name: parts[name]() for name in names}))
 
 

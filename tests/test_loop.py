@@ -14,6 +14,7 @@ import pytest
 
 from ne_dreamer_jax import agents
 from ne_dreamer_jax import loop as loops
+from ne_dreamer_jax.agents.guard import SKIPPED
 from ne_dreamer_jax.loop import LoopConfig
 from ne_dreamer_jax.loop.collect import transition
 from ne_dreamer_jax.system import memory
@@ -210,6 +211,27 @@ def test_updates_learn_from_the_newest_parameters_and_latents_return_to_replay(l
     kept, _ = ran(make(write_latents=False), STEPS)
     t = np.asarray(kept.replay.data.obs["vector"][..., 1])
     np.testing.assert_array_equal(kept.replay.data.latent.deter[..., 0], t)
+
+
+@pytest.mark.parametrize(("good", "in_a_row"), [(0, 7), (3, 4), (7, 0)])
+def test_updates_skipped_in_a_row_are_those_since_the_last_one_that_was_made(good, in_a_row):
+    """Of the eight of each vector step one is made, the first, the fourth or the last."""
+    env = counting.env(image=False)
+    agent = counting.stub(env.spec, weight=1.0)  # so that params count the calls
+    made = agent.train_step
+
+    def train_step(state, batch):
+        new, latent, metrics = made(state, batch)
+        is_made = state.params.astype(jnp.int32) % 8 == good
+        update = jnp.where(is_made, new.update, state.update)
+        return new._replace(update=update), latent, metrics | {SKIPPED: jnp.where(is_made, 0.0, 1.0)}
+
+    agent.train_step = train_step
+    config = dataclasses.replace(CONFIG, replay_ratio=16.0)  # eight updates of 2 x 3 steps for three agent steps
+    loop = loops.make(config, env, agent, action_repeat=2)
+    state, (report,) = ran(loop, 10)
+    assert report.learning[SKIPPED] == 7 * int(state.train.update) > 0
+    assert int(state.counters.skipped) == in_a_row
 
 
 def test_latents_are_stored_in_the_chosen_dtype():
@@ -465,3 +487,10 @@ def test_replay_ratios_that_cant_be_kept_are_refused(ratio):
     with pytest.raises(ValueError, match=r"expected 0 \(never learn\) or at least 0.001"):
         loops.Budget.of(LoopConfig(replay_ratio=ratio), 2, 3, 1)
     loops.Budget.of(LoopConfig(replay_ratio=0.001), 2, 3, 1)
+
+
+def test_more_sequences_of_environments_than_32_bits_count_are_refused():
+    with pytest.raises(
+        ValueError, match=r"loop.num_envs times agent.batch_size below 2\*\*31, got 65,536 times 32,768"
+    ):
+        loops.Budget.of(LoopConfig(num_envs=2**16, replay_ratio=0.001), 2**15, 1, 1)

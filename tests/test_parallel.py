@@ -38,7 +38,7 @@ def compute(*parts):
 
 @pytest.fixture(scope="module")
 def computed():
-    return compute("environments_and_replay", "images_on_the_host", "collectives", "moved")
+    return compute("environments_and_replay", "images_on_the_host", "collectives", "moved", "model_free")
 
 
 @pytest.mark.strict
@@ -67,6 +67,14 @@ def test_no_pixels_travel(computed):
 @pytest.mark.strict
 def test_checkpoints_move_between_numbers_of_devices(computed):
     assert computed["moved"] == {"1 to 8": True, "8 to 1": True, "8 to 2": True}
+
+
+def test_the_model_free_baselines_losses_are_those_of_one_device(computed):
+    one, eight = computed["model_free"]
+    assert one.keys() == eight.keys() > {"loss/critic", "loss/actor"}
+    assert one["policy steps"] > 0
+    for name in one:
+        np.testing.assert_allclose(eight[name], one[name], rtol=1e-4, atol=1e-5, err_msg=name)
 
 
 @pytest.mark.slow

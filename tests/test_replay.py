@@ -136,9 +136,12 @@ def test_repeated_steps_keep_the_last_latent():
         np.testing.assert_array_equal(written.data.latent.stoch[flat // N, flat % N], np.argmax(stoch[b, t], -1))
 
 
-@pytest.mark.parametrize(("classes", "dtype"), [(1, "uint8"), (256, "uint8"), (257, "uint16"), (300, "uint16")])
+@pytest.mark.parametrize(
+    ("classes", "dtype"), [(1, "uint8"), (256, "uint8"), (257, "uint16"), (300, "uint16"), (65_537, "uint32")]
+)
 def test_every_class_survives_storage(classes, dtype):
-    stoch = jax.nn.one_hot(jnp.arange(N * 100).reshape(N, 100) % classes, classes)
+    latents = min(100, 100_000 // classes)
+    stoch = jax.nn.one_hot(jnp.arange(N * latents).reshape(N, latents) % classes, classes)
     stoch = stoch.at[0, 0].set(jax.nn.one_hot(classes - 1, classes))
     step = STEPS[0]._replace(latent=Latent(jnp.ones((N, 1)), stoch))
     state = replay.add(replay.add(replay.init(step, 2 * N, N), step), step)
@@ -293,6 +296,11 @@ def test_latents_unlike_the_batch_are_refused():
 def test_lengths_that_never_fit_are_refused(length):
     with pytest.raises(ValueError, match="expected a length of 1 to 6 steps"):
         replay.sample(ring(C), jax.random.key(0), 2, length)
+
+
+def test_more_sequences_of_environments_than_32_bits_count_are_refused():
+    with pytest.raises(ValueError, match=r"expected fewer than 2\*\*31 for environments times sequences"):
+        jax.eval_shape(lambda state: replay.sample(state, jax.random.key(0), -(-(2**31) // N), 2), ring(C))
 
 
 @pytest.mark.parametrize(("capacity", "envs"), [(5, 3), (10, 0), (2**31, 3)])

@@ -57,6 +57,10 @@ class Budget:
                 f"{config.replay_ratio:g} for {n:,} environments and batches of {batch_size} x {length}; take a "
                 "rounder ratio"
             )
+        if n * batch_size >= 2**31:
+            raise ValueError(
+                f"expected loop.num_envs times agent.batch_size below 2**31, got {n:,} times {batch_size:,}"
+            )
         least = (length + 1) * n
         if config.capacity is not None and config.capacity < least:
             raise ValueError(

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.base import Agent
 from ne_dreamer_jax.replay import ring
 from ne_dreamer_jax.replay.storage import Storage
 from ne_dreamer_jax.types import Array, Batch, Metrics
+
+
+class Learning(NamedTuple):
+    """What updates change."""
+
+    train: Any  # the agent's train state
+    replay: Any
+    key: Array
+    sums: Metrics  # of the updates' metrics
+    skipped: Array  # int32 [], updates skipped in a row, the last one included
 
 
 @jax.named_scope("replay")
@@ -41,16 +52,14 @@ def learn(
     return train, replay, guard.counted(metrics)
 
 
-def learn_what_is_due(
-    agent: Agent, storage: Storage, write_latents: bool, due: Array, train: Any, replay: Any, key: Array, sums: Metrics
-) -> tuple[Any, Any, Metrics]:
-    """So many updates (int32 []), one after another; ``sums`` with their metrics added."""
+def learn_what_is_due(agent: Agent, storage: Storage, write_latents: bool, due: Array, before: Learning) -> Learning:
+    """So many updates (int32 []), one after another."""
 
-    def update(carry: tuple[Any, Any, Array, Metrics]) -> tuple[Any, Any, Array, Metrics]:
-        train, replay, key, sums = carry
-        key, sample_key = jax.random.split(key)
-        train, replay, metrics = learn(agent, storage, write_latents, train, replay, sample_key)
-        return train, replay, key, {name: sums[name] + metrics[name] for name in sums}
+    def update(learning: Learning) -> Learning:
+        key, sample_key = jax.random.split(learning.key)
+        train, replay, metrics = learn(agent, storage, write_latents, learning.train, learning.replay, sample_key)
+        sums = {name: learning.sums[name] + metrics[name] for name in learning.sums}
+        skipped = jnp.where(train.update > learning.train.update, 0, learning.skipped + 1)
+        return Learning(train, replay, key, sums, skipped)
 
-    train, replay, _, sums = jax.lax.fori_loop(0, due, lambda _, carry: update(carry), (train, replay, key, sums))
-    return train, replay, sums
+    return jax.lax.fori_loop(0, due, lambda _, learning: update(learning), before)

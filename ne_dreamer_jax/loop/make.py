@@ -23,7 +23,7 @@ from ne_dreamer_jax.loop import placement
 from ne_dreamer_jax.loop.budget import Budget
 from ne_dreamer_jax.loop.collect import collect, transition
 from ne_dreamer_jax.loop.config import LoopConfig
-from ne_dreamer_jax.loop.learn import draw_batch, learn_what_is_due
+from ne_dreamer_jax.loop.learn import Learning, draw_batch, learn_what_is_due
 from ne_dreamer_jax.loop.play import Evaluation, make_play
 from ne_dreamer_jax.loop.state import Counters, Episodes, Finished, LoopState, Report
 from ne_dreamer_jax.replay import ring
@@ -166,11 +166,9 @@ def chunk(
         if env.start is not None:  # learning begins when the environments' step has begun
             due, env_state = jax.lax.optimization_barrier((due, state.env))
             state = state._replace(env=env_state)
-        train, replay, sums = learn_what_is_due(
-            agent, storage, config.write_latents, due, state.train, state.replay, update_key, sums
-        )
-        in_a_row = jnp.where(train.update > state.train.update, 0, state.counters.skipped + due)
-        counters = Counters(done, credit - due * budget.update_cost, in_a_row)
+        learning = Learning(state.train, state.replay, update_key, sums, state.counters.skipped)
+        train, replay, _, sums, skipped = learn_what_is_due(agent, storage, config.write_latents, due, learning)
+        counters = Counters(done, credit - due * budget.update_cost, skipped)
         return state._replace(train=train, replay=replay, counters=counters, key=key), finished, sums
 
     state, finished, sums = jax.lax.fori_loop(

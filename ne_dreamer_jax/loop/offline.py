@@ -11,10 +11,13 @@ import jax.numpy as jnp
 
 from ne_dreamer_jax.agents import guard
 from ne_dreamer_jax.agents.base import Agent
-from ne_dreamer_jax.loop.learn import draw_batch, learn_what_is_due
+from ne_dreamer_jax.loop.learn import Learning, draw_batch, learn_what_is_due
 from ne_dreamer_jax.replay import ring, storage
 from ne_dreamer_jax.system.numerics import in_32_bits
 from ne_dreamer_jax.types import Array, Metrics
+
+BLOCK = 1_024
+"""Updates whose metrics are added up before they join those of the others, as a long float32 sum rounds to one side."""
 
 
 def train_offline(
@@ -74,9 +77,18 @@ def _program(learner: _Learner, write_latents: bool) -> Callable[..., tuple[Any,
         batch = jax.eval_shape(partial(draw_batch, agent, kept), replay, key)
         shapes = jax.eval_shape(agent.train_step, state, batch)[2]
         sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        before = state.update
-        state, replay, sums = learn_what_is_due(agent, kept, write_latents, updates, state, replay, key, sums)
+        before, zero = state.update, jnp.zeros((), jnp.int32)
+
+        def block(number: Array, carry: tuple[Learning, Metrics]) -> tuple[Learning, Metrics]:
+            learning, totals = carry
+            due = jnp.minimum(updates - number * BLOCK, BLOCK)
+            learning = learn_what_is_due(agent, kept, write_latents, due, learning._replace(sums=sums))
+            return learning, jax.tree.map(jnp.add, totals, learning.sums)
+
+        learning = Learning(state, replay, key, sums, zero)
+        learning, totals = jax.lax.fori_loop(0, -(-updates // BLOCK), block, (learning, sums))
+        state, replay = learning.train, learning.replay
         made = (state.update - before).astype(jnp.float32)
-        return state, replay, {name: x if guard.is_count(name) else x / made for name, x in sums.items()}
+        return state, replay, {name: x if guard.is_count(name) else x / made for name, x in totals.items()}
 
     return jax.jit(in_32_bits(run), donate_argnums=(0, 1))

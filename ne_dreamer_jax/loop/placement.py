@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 from jax.sharding import Mesh
 
 from ne_dreamer_jax.loop.state import LoopState
@@ -14,7 +15,8 @@ from ne_dreamer_jax.system import parallel
 def shardings(mesh: Mesh, shapes: LoopState) -> LoopState:
     """A sharding for every array: environments and replay are divided over the devices, the rest is whole on each."""
     specs: dict[str, Any] = dict.fromkeys(LoopState._fields, parallel.WHOLE)
-    specs |= dict.fromkeys(("env", "policy", "episodes"), parallel.SPLIT)
+    specs |= dict.fromkeys(("env", "episodes"), parallel.SPLIT)
+    specs["policy"] = jax.tree.map(lambda x: parallel.SPLIT if x.ndim else parallel.WHOLE, shapes.policy)
     specs["replay"] = ring.partition(shapes.replay)
     return parallel.shardings(mesh, LoopState(**specs), shapes)
 

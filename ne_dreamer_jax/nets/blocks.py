@@ -66,6 +66,11 @@ def _unstack(x: Array, axis: int) -> list[Array]:
     return [jax.lax.squeeze(part, (axis,)) for part in parts]
 
 
+def add_bias(x: Array, bias: Array) -> Array:
+    """x plus a float32 bias of its last axes, in x's dtype; the bias' gradient is a sum in float32 all the same."""
+    return x + jnp.broadcast_to(bias, x.shape).astype(x.dtype)
+
+
 class Linear(nn.Module):
     """Affine map ``[..., I]`` to ``[..., units]``."""
 
@@ -81,8 +86,7 @@ class Linear(nn.Module):
         product = x.astype(self.dtype) @ kernel.astype(self.dtype)
         if not self.use_bias:
             return product
-        bias = self.param("bias", self.bias_init, (self.units,), jnp.float32).astype(self.dtype)
-        return product + jnp.expand_dims(bias, range(product.ndim - 1))
+        return add_bias(product, self.param("bias", self.bias_init, (self.units,), jnp.float32))
 
 
 class RMSNorm(nn.Module):

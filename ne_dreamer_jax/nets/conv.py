@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ne_dreamer_jax.nets.blocks import rms_norm
+from ne_dreamer_jax.nets.blocks import add_bias, rms_norm
 from ne_dreamer_jax.nets.cpu import conv as cpu_conv
 from ne_dreamer_jax.nets.cpu.conv import Stage as Stage
 from ne_dreamer_jax.nets.pixels import centred, space_to_depth
@@ -115,7 +115,7 @@ def embed_patches(images: Array, stage: Stage, dtype: Any = jnp.float32) -> Arra
     if any(side % p for side in images.shape[1:3]):
         raise ValueError(f"Expected images whose sides are multiples of {p}, the kernel's, {shapes}.")
     x = space_to_depth(centred(images).astype(dtype), p)
-    x = x @ kernel.reshape(-1, kernel.shape[-1]).astype(dtype) + stage.bias.astype(dtype)[None, None, None]
+    x = add_bias(x @ kernel.reshape(-1, kernel.shape[-1]).astype(dtype), stage.bias)
     return jax.nn.silu(rms_norm(x, stage.scale))
 
 
@@ -123,7 +123,7 @@ def lax_encode_images(images: Array, stages: Sequence[Stage], dtype: Any = jnp.f
     """`encode_images` as a composition of XLA's own operations."""
     x = centred(images).astype(dtype)
     for stage in stages:
-        x = _pool(lax_conv2d(x, stage.kernel.astype(dtype)) + stage.bias.astype(dtype)[None, None, None])
+        x = _pool(add_bias(lax_conv2d(x, stage.kernel.astype(dtype)), stage.bias))
         x = jax.nn.silu(rms_norm(x, stage.scale))
     return x
 

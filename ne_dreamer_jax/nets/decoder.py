@@ -12,7 +12,7 @@ import numpy as np
 from flax.linen import initializers
 
 from ne_dreamer_jax.nets import conv
-from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init
+from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, add_bias, block_linear, kernel_init
 from ne_dreamer_jax.nets.encoder import EncoderConfig, split_observation
 from ne_dreamer_jax.nets.pixels import depth_to_space
 from ne_dreamer_jax.nets.rssm import feature
@@ -88,11 +88,10 @@ class Decoder(nn.Module):
         kernel = self.param("deter_kernel", kernel_init(), (blocks, size // blocks, outputs), jnp.float32)
         bias = self.param("deter_bias", initializers.zeros_init(), (blocks, outputs), jnp.float32)
         x = block_linear(deter.reshape(-1, blocks, size // blocks).astype(self.dtype), kernel.astype(self.dtype))
-        return spread_blocks(x + bias.astype(self.dtype)[None], height, width)
+        return spread_blocks(add_bias(x, bias), height, width)
 
     def _upsampled(self, x: Array, name: str, channels: int) -> Array:
         side = self.config.kernel
         kernel = self.param(f"{name}_kernel", kernel_init(), (side, side, x.shape[-1], channels), jnp.float32)
         bias = self.param(f"{name}_bias", initializers.zeros_init(), (channels,), jnp.float32)
-        y = conv.upsampled_conv2d(x, kernel.astype(self.dtype))
-        return y + bias.astype(self.dtype)[None, None, None]
+        return add_bias(conv.upsampled_conv2d(x, kernel.astype(self.dtype)), bias)

@@ -15,7 +15,16 @@ import jax.numpy as jnp
 from flax.linen import initializers
 
 from ne_dreamer_jax.losses import unimix_logits
-from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, RMSNorm, block_linear, kernel_init, per_block
+from ne_dreamer_jax.nets.blocks import (
+    MLP,
+    Block,
+    Linear,
+    RMSNorm,
+    add_bias,
+    block_linear,
+    kernel_init,
+    per_block,
+)
 from ne_dreamer_jax.nets.rematerialise import keeping_products
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, Share, Width
@@ -89,7 +98,7 @@ def sample_onehot(uniform: Array, logits: Array) -> Array:
 
 def _gate(x: Array, state: Array, kernel: Array, bias: Array) -> Array:
     """A block's GRU gates: its new state [N, D / blocks] float32 from the candidate's input x and the old state."""
-    gates = (x @ kernel + bias[None]).astype(jnp.float32)
+    gates = add_bias(x @ kernel, bias).astype(jnp.float32)
     reset, candidate, update = jnp.split(gates, 3, axis=-1)
     candidate = jnp.tanh(nn.sigmoid(reset) * candidate)
     update = nn.sigmoid(update - 1)
@@ -143,7 +152,7 @@ class RSSM(nn.Module):
     def embed_observation(self, embedding: Array) -> Array:
         """The embedding's share of the posterior's first layer: ``[..., E]`` to ``[..., hidden]``."""
         product = embedding.astype(self.dtype) @ self.posterior_kernel[self.config.deter :].astype(self.dtype)
-        return product + jnp.expand_dims(self.posterior_bias.astype(self.dtype), range(product.ndim - 1))
+        return add_bias(product, self.posterior_bias)
 
     def recur(self, latent: Latent, action_in: Array) -> Array:
         """``h_t`` float32 [N, D] from the previous latent [N, ...] and ``embed_action(a_{t-1}) [N, hidden]``."""
@@ -152,10 +161,9 @@ class RSSM(nn.Module):
         inputs = jnp.concatenate([self.deter_in(latent.deter), self.stoch_in(flat), action_in], axis=-1)
         state = latent.deter.reshape(-1, c.blocks, c.deter // c.blocks)
         own = block_linear(state.astype(dtype), self.state_kernel.astype(dtype))
-        x = own.reshape(-1, c.deter) + inputs @ self.input_kernel.astype(dtype) + self.hidden_bias.astype(dtype)[None]
+        x = add_bias(own.reshape(-1, c.deter) + inputs @ self.input_kernel.astype(dtype), self.hidden_bias)
         x = nn.silu(self.hidden_norm(x)).reshape(state.shape)
-        gates = self.gate_kernel.astype(dtype), self.gate_bias.astype(dtype)
-        return per_block(_gate, (x, state), gates).reshape(-1, c.deter)
+        return per_block(_gate, (x, state), (self.gate_kernel.astype(dtype), self.gate_bias)).reshape(-1, c.deter)
 
     def prior(self, deter: Array) -> Array:
         """Logits of ``p(z_t | h_t)``: ``[..., D]`` to float32 ``[..., S, K]``, not yet mixed with the uniform."""

@@ -145,9 +145,10 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
     """B sequences of T steps, each with the step before it as context.
 
     Slices of T + 1 steps that are consecutive in one environment are drawn uniformly, with replacement, from all that
-    the ring holds; none contains both the newest and the oldest step of a full ring. They may cross episodes. The draw
-    is stratified over environments: sequence b comes from one between b * N / B and (b + 1) * N / B. So k devices,
-    where k divides B and N, find each their share of the sequences in their share of the environments.
+    the ring holds, so that its oldest step is never more than context; none contains both the newest and the oldest
+    step of a full ring. They may cross episodes. The draw is stratified over environments: sequence b comes from one
+    between b * N / B and (b + 1) * N / B. So k devices, where k divides B and N, find each their share of the sequences
+    in their share of the environments.
 
     Args:
       replay: the ring; unless ``can_sample(replay, length)``, the batch contains steps that were never written.
@@ -156,13 +157,17 @@ def sample(replay: Replay, key: Array, batch_size: int, length: int) -> Batch:
       length: T.
 
     Raises:
-      ValueError: where no ring of this capacity can ever hold T + 1 steps of an environment.
+      ValueError: where no ring of this capacity can ever hold T + 1 steps of an environment, or 32 bits N * B.
     """
     rows, envs = replay.data.reward.shape
     if not 1 <= length < rows:
         raise ValueError(
             f"expected a length of 1 to {rows - 1} steps, got {length}: a sequence and the step before it must fit in "
             f"the {rows} steps that the ring keeps of each of {envs} envs (capacity {rows * envs:,})"
+        )
+    if envs * batch_size >= 2**31:
+        raise ValueError(
+            f"expected fewer than 2**31 for environments times sequences, got {envs:,} times {batch_size:,}"
         )
     starts = jnp.maximum(replay.size - length, 1)  # of slices, in each environment
     start_key, env_key = jax.random.split(key)
@@ -335,8 +340,8 @@ def _gather(classes: int, data: Transition, row: Array, env: Array) -> Batch:
 
 def _compact(latent: Latent, deter_dtype: Any) -> Latent:
     """One-hot [..., S, K] to classes [..., S] in the smallest unsigned type."""
-    class_dtype = jnp.uint8 if latent.stoch.shape[-1] <= 256 else jnp.uint16
-    return Latent(latent.deter.astype(deter_dtype), jnp.argmax(latent.stoch, axis=-1).astype(class_dtype))
+    smallest = next(x for x in (jnp.uint8, jnp.uint16, jnp.uint32) if latent.stoch.shape[-1] - 1 <= jnp.iinfo(x).max)
+    return Latent(latent.deter.astype(deter_dtype), jnp.argmax(latent.stoch, axis=-1).astype(smallest))
 
 
 def _expand(latent: Latent, classes: int) -> Latent:

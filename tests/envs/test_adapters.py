@@ -309,6 +309,17 @@ def test_repeated_actions_add_up_rewards_until_it_is_done():
     assert sorted(env.spec.observation) == ["double", "position"]
 
 
+def test_a_time_limit_within_a_repeated_step_ends_it_there():
+    """A state beyond the limit, here a terminal one, is never reached."""
+    env = from_brax(fakes.Brax(), episode_length=3, action_repeat=2)
+    (state, _), _, (last, third) = play(env, [0.8, 0.8])
+    start = float(state.core.env[0].place)
+    assert start + 4 * 0.8 > fakes.GOAL > start + 3 * 0.8
+    np.testing.assert_allclose(last.core.env[0].place, start + 3 * 0.8, rtol=1e-6)
+    np.testing.assert_allclose(third.reward, start + 3 * 0.8, rtol=1e-6)
+    assert (bool(third.is_last), bool(third.is_terminal)) == (True, False)
+
+
 def test_braxs_own_time_limit_is_believed():
     class Limited(fakes.Brax):
         def reset(self, rng):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, kernel_init, rms_norm
+from ne_dreamer_jax.nets.blocks import MLP, Block, Linear, add_bias, kernel_init, rms_norm
 
 
 @pytest.mark.parametrize(("shape", "fan_in"), [((400, 250), 400), ((5, 5, 16, 250), 400)])
@@ -46,6 +46,28 @@ def test_linear_is_the_product_and_the_bias(use_bias):
     want = x.astype(np.float64) @ params["kernel"] + params.get("bias", 0.0)
     got = Linear(5, use_bias=use_bias).apply({"params": params}, jnp.asarray(x))
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+
+
+def test_in_bfloat16_a_biass_gradient_is_summed_in_float32():
+    """The sum is as near as the rounded numbers that are added, however many rows there are."""
+    rows = np.random.default_rng(0).normal(1.0, 1.0, (40_000, 2)).astype(jnp.bfloat16)
+
+    def weighted(bias):
+        return jnp.sum((add_bias(jnp.zeros(rows.shape, jnp.bfloat16), bias) * rows).astype(jnp.float32))
+
+    gradient = jax.jit(jax.grad(weighted))(jnp.zeros(2))
+    assert gradient.dtype == jnp.float32
+    np.testing.assert_allclose(gradient, rows.astype(np.float64).sum(0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("module", [Linear(3, dtype=jnp.bfloat16), Block(3, dtype=jnp.bfloat16)])
+def test_in_bfloat16_no_module_sums_in_it(module):
+    x = jnp.ones((5, 2))
+    params = module.init(jax.random.key(0), x)
+    text = str(jax.make_jaxpr(jax.grad(lambda params: jnp.sum(module.apply(params, x).astype(jnp.float32))))(params))
+    sums = [line for line in text.splitlines() if "reduce_sum" in line]
+    assert sums
+    assert not any(line.split("=")[0].strip().split(":")[1].startswith("bf16") for line in sums), sums
 
 
 def test_a_stack_is_linear_norm_silu_in_turn():

@@ -54,8 +54,9 @@ def from_brax(env: Any, *, episode_length: int | None, action_repeat: int = 1, i
     """Makes an environment of a Brax-style one, whose actions are in [-1, 1]. Its state is ``env_state.core.env[0]``.
 
     Args:
-      episode_length: steps of the environment after which an episode is cut; None: never.
-      action_repeat: steps of the environment in one; their rewards are added up, until it is done.
+      episode_length: steps of the environment after which an episode is cut, also within one of the repeated steps;
+        None: never.
+      action_repeat: steps of the environment in one; their rewards are added up, until it is done or out of time.
 
     Raises:
       ValueError: an option has a bad value, or as of `common.adapt`.
@@ -69,13 +70,16 @@ def from_brax(env: Any, *, episode_length: int | None, action_repeat: int = 1, i
         state = env.reset(key)
         return (state, jnp.zeros((), jnp.int32)), state.obs
 
+    def out_of_time(steps: Array) -> Array:
+        return jnp.zeros((), bool) if episode_length is None else steps >= episode_length
+
     def step(carried: tuple[Any, Array], action: Array, key: Array) -> common.Outcome:
         state, steps = carried
 
         def again(number: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
             old, total = carry
             new = env.step(old, action)
-            over = common.scalar("done", old.done, jnp.bool_) & (number > 0)
+            over = (common.scalar("done", old.done, jnp.bool_) | out_of_time(steps + number)) & (number > 0)
             kept = jax.tree.map(lambda x, y: jnp.where(over, x, y.astype(x.dtype)), old, common.cast(new, shapes(old)))
             return kept, total + jnp.where(over, 0.0, common.scalar("the reward", new.reward, one))
 
@@ -87,8 +91,7 @@ def from_brax(env: Any, *, episode_length: int | None, action_repeat: int = 1, i
         steps = steps + action_repeat
         done = common.scalar("done", state.done, jnp.bool_)
         cut = common.scalar("truncation", state.info.get("truncation", False), jnp.bool_)
-        out_of_time = jnp.zeros((), bool) if episode_length is None else steps >= episode_length
-        return common.Outcome((state, steps), state.obs, total, done | out_of_time, done & ~cut)
+        return common.Outcome((state, steps), state.obs, total, done | out_of_time(steps), done & ~cut)
 
     size = int(env.action_size)
     return common.adapt(reset, step, None, common.Box(-1.0, 1.0, (size,), jnp.float32), image_size)
