@@ -6,7 +6,6 @@ of its own, and draws all of it into one figure.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import signal
 import statistics
@@ -121,15 +120,18 @@ def train_missing(
 
 
 def expect_evaluations(settings: Common, task: str | None, methods: Sequence[str]) -> None:
-    """Raises ValueError where a method's runs would have none."""
+    """Raises ValueError where a method's runs would have none, or the settings fit no method."""
+    refused: list[ValueError] = []
     for method in methods:
-        with contextlib.suppress(ValueError):  # a method that does not fit is refused when its turn comes
-            if settings.config(task, method, 0).loop.eval_every is not None:
-                continue
-            break
-    else:
-        return
-    raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
+        try:
+            config = settings.config(task, method, 0)
+        except ValueError as error:  # a method that does not fit is refused when its turn comes
+            refused.append(error)
+            continue
+        if config.loop.eval_every is None:
+            raise ValueError("loop.eval_every: expected a number of steps, as evaluations are compared, got none")
+    if len(refused) == len(methods):
+        raise refused[0]
 
 
 def train(path: Path, options: Sequence[str]) -> int:

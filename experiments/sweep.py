@@ -20,9 +20,10 @@ from typing import Any, NamedTuple
 import click
 
 from experiments.common import Common, common
-from ne_dreamer_jax.commands.options import Name, Task, UserPath, say
+from ne_dreamer_jax.commands.options import Name, Task, UserPath, refusing, say
 from ne_dreamer_jax.runs.run_directory import as_argument
 from ne_dreamer_jax.settings import names
+from ne_dreamer_jax.system.quiet import quiet
 
 GPUS = "CUDA_VISIBLE_DEVICES"
 POLL = 2.0  # seconds between two looks at the jobs
@@ -111,7 +112,9 @@ def main(
     """
     if partition is not None and not slurm:
         raise click.UsageError("expected --partition together with --slurm")
-    runs = plan(tasks, methods, range(seeds), Common(**settings), logdir)
+    quiet()
+    with refusing(ValueError):
+        runs = plan(tasks, methods, range(seeds), Common(**settings), logdir)
     if dry_run:
         for run in runs:
             say(shlex.join(run.command))
@@ -134,7 +137,12 @@ def main(
 def plan(
     tasks: Sequence[str], methods: Sequence[str], seeds: Sequence[int], settings: Common, logdir: Path
 ) -> list[Run]:
-    """All runs of a sweep, seed by seed, so that what comes first covers all tasks and methods."""
+    """All runs of a sweep, seed by seed, so that what comes first covers all tasks and methods.
+
+    Raises ValueError where the settings do not fit one of them.
+    """
+    for task, method in itertools.product(tasks, methods):
+        settings.config(task, method, 0)
     runs = []
     for seed, task, method in itertools.product(seeds, dict.fromkeys(tasks), dict.fromkeys(methods)):
         folder = logdir / task.replace("/", "_") / method.replace("/", "_") / f"seed{seed}"

@@ -1,7 +1,8 @@
 """What a setting is worth: variants of one configuration, several seeds each, and the interval of their difference.
 
 A variant is one or more settings, joined by commas, or ``default``; the first is what the others are compared with. Its
-seeds train one after the other, in one compiled program.
+seeds train one after the other, in one compiled program. Results in OUT are found again by their configuration,
+however the variant was spelt.
 
 Usage: ``python -m experiments.switches runs/head.jsonl agent.behavior.discount_in_head=true
 agent.behavior.discount_in_head=false --task dmc/cartpole_swingup --seeds 8``
@@ -54,7 +55,7 @@ SMALL = (
 @click.option("--task", "tasks", type=Task(), multiple=True, help="May be repeated. Default: the preset's.")
 @click.option("--method", type=Name("method", names.METHODS), default=names.METHODS[0])
 @click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart")
-@click.option("--obs", type=Name("observation", names.OBSERVATIONS), default=None, help="Of DeepMind Control's tasks.")
+@click.option("--obs", type=Name("observation", names.OBSERVATIONS), help="pixels, vector or both.")
 @click.option("--small", is_flag=True, help="A small agent, for vectors.")
 @click.option("--seeds", type=click.IntRange(2, 1000), default=5, help="Seeds 0, 1, ... of each.")
 @click.option(
@@ -80,6 +81,8 @@ def main(
     common = (*(SMALL if small else ()), *assignments)
     if any(re.match(r"seed\s*=", setting.strip()) for text in (*common, *variants) for setting in _settings(text)):
         raise click.UsageError("seed: each variant has the seeds 0, 1, ..., of which --seeds says how many")
+    if strange := [text for text in variants if text != DEFAULT and "=" not in text]:
+        raise click.UsageError(f"expected {DEFAULT!r} or PATH=VALUE as a variant, got {strange[0]!r}")
     with refusing(ValueError):
         made = {
             (task, variant): configure(
@@ -88,6 +91,8 @@ def main(
             for task in tasks or (None,)
             for variant in variants
         }
+        for config in made.values():
+            _expect_updates(config)
         with _locked(out):  # what is no such file, or can't be written, is refused before anything trains
             _read(out)
         find_devices()
@@ -95,6 +100,18 @@ def main(
     say("")
     for row in table(compared):
         say(row)
+
+
+def _expect_updates(config: Config) -> None:
+    """Raises ValueError for a run that learns nothing."""
+    from ne_dreamer_jax.loop.budget import Budget
+
+    agent, loop = config.agent, config.loop
+    if not Budget.of(loop, agent.batch_size, agent.batch_length, config.env.action_repeat).updates:
+        raise ValueError(
+            f"loop.env_steps: expected enough for an update after a loop.prefill of {loop.prefill:,} agent steps, got "
+            f"{loop.env_steps:,}"
+        )
 
 
 def _settings(variant: str) -> tuple[str, ...]:
@@ -107,7 +124,7 @@ def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, A
 
     Raises ValueError as `_read`.
     """
-    is_same = lambda line: line["config"] == plain(config) and line["variant"] == variant
+    is_same = lambda line: line["config"] == plain(config)
     found = max(filter(is_same, _read(out)), key=lambda line: line["seeds"], default=None)
     done = 0 if found is None else found["seeds"]
     if done < seeds:
@@ -117,7 +134,7 @@ def _results(out: Path, config: Config, variant: str, seeds: int) -> dict[str, A
             found = line
             _keep(out, line, is_same)
     assert found is not None
-    return found | {"seeds": seeds, "curves": found["curves"][:seeds]}
+    return found | {"variant": variant, "seeds": seeds, "curves": found["curves"][:seeds]}
 
 
 @contextlib.contextmanager
@@ -134,7 +151,7 @@ def _locked(out: Path) -> Iterator[None]:
 
 
 def _keep(out: Path, line: dict[str, Any], is_same: Callable[[dict[str, Any]], bool]) -> None:
-    """Adds a line to the file in place of the ``same`` variant's with fewer seeds. Other commands may do so, too."""
+    """Adds a line to the file in place of the same configuration's with fewer seeds. Other commands may do so, too."""
     with _locked(out):
         lines = _read(out)
         furthest = max([line, *filter(is_same, lines)], key=lambda each: each["seeds"])

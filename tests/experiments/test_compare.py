@@ -111,6 +111,13 @@ def test_a_finished_run_that_is_to_have_more_steps_goes_on(tmp_path, invoke):
     assert compare.finished(run, settings._replace(assignments=[f"loop.env_steps={BUDGET}"]), None, "r2dreamer", 0)
 
 
+def test_a_setting_that_fits_no_method_is_refused_once(tmp_path, invoke):
+    code, output, started = invoke(compare, tmp_path / "new", "--set", "agent.foo=1")
+    assert (code, started) == (2, [])
+    assert output.count("agent.foo") == 1
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("name", ["config.json", "metrics.jsonl"])
 def test_a_run_that_cant_be_read_is_named(tmp_path, invoke, name):
     invoke(compare, tmp_path, "--method", "r2dreamer", "--seeds", 1)

@@ -51,6 +51,8 @@ def test_every_run_has_its_command_and_its_directory(tmp_path):
     [
         (["--task", "dmc/walker_wlak"], "no environment is called 'dmc/walker_wlak'"),
         (["--task", "dmc/walker_walk", "--partition", "gpu"], "expected --partition together with --slurm"),
+        (["--task", "dmc/walker_walk", "--set", "agent.behavior.discont=1", "--dry-run"], "agent.behavior.discount"),
+        (["--task", "rooms/watermaze_small", "--obs", "vector"], "says itself how it is observed"),
     ],
 )
 def test_what_is_mistyped_is_refused(tmp_path, arguments, message):

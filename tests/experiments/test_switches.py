@@ -66,6 +66,26 @@ def test_a_variant_may_be_the_preset_itself(invoke, monkeypatch):
     assert "| `default` | 10 12 11 |" in output
 
 
+def test_results_are_found_again_however_the_variant_is_spelt(invoke):
+    invoke("agent.behavior.lam=0.95", "--seeds", "3")
+    code, output, trained = invoke("agent.behavior.lam=0.950", "--seeds", "3")
+    assert (code, len(trained)) == (0, 1)
+    assert "| `agent.behavior.lam=0.950` | 10 12 11 |" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["defualt"], "expected 'default' or PATH=VALUE as a variant, got 'defualt'"),
+        (["default", "--set", "loop.env_steps=100"], "loop.env_steps: expected enough for an update"),
+    ],
+)
+def test_what_can_tell_nothing_is_refused(invoke, tmp_path, arguments, message):
+    code, output, trained = invoke(*arguments)
+    assert (code, trained, list(tmp_path.iterdir())) == (2, [], [])
+    assert message in " ".join(output.split())
+
+
 def test_seeds_that_are_there_are_kept_whatever_ends_the_command(invoke, tmp_path):
     invoke.stopping_at[VARIANTS[0]] = 1
     code, _, _ = invoke(VARIANTS[0], "--seeds", "3")
