@@ -1,6 +1,7 @@
 """What JAX is told by the user's environment changes neither the program's types nor whether it runs."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pytest
 import ne_dreamer_jax as nedreamer
 from ne_dreamer_jax import loop as loops
 from ne_dreamer_jax.envs import dmc, probes
+from ne_dreamer_jax.nets.platform import traced_for
 from ne_dreamer_jax.replay import ring as replay
 from tests import tiny
 from tests.drqv2 import small
@@ -88,6 +90,22 @@ def test_64_bit_mode_changes_no_value(method, observation):
     assert described(got) == described(expected)
     for name, value in got[1].items():
         np.testing.assert_allclose(value, expected[1][name], rtol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda"])
+@pytest.mark.parametrize("method", tiny.OBJECTIVES)
+def test_in_bfloat16_nothing_is_summed_in_it(method, platform):
+    """Products add in float32 inside; a sum of its own, as a bias' gradient over all rows, has to be asked for."""
+    config = replace(tiny.with_method(tiny.OBJECTIVES[method]), compute_dtype="bfloat16")
+    with traced_for(platform):
+        agent = nedreamer.make_agent(config, tiny.BOTH)
+        shapes = jax.eval_shape(agent.init, jax.random.key(0))
+        batch = jax.eval_shape(lambda key: replay.random_batch(tiny.BOTH, config, key), jax.random.key(1))
+        program = str(jax.make_jaxpr(agent.train_step)(shapes, batch))
+    sums = re.findall(r"(\w+)\[[\d,]*\] = reduce_sum\[", program)
+    assert len(sums) > 100
+    assert "bf16" not in sums
+    assert "bf16" in program
 
 
 @pytest.mark.parametrize("method", [name for name in tiny.OBJECTIVES if name != "ne_dreamer"])

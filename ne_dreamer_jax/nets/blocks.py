@@ -67,8 +67,8 @@ def _unstack(x: Array, axis: int) -> list[Array]:
 
 
 def add_bias(x: Array, bias: Array) -> Array:
-    """x plus a float32 bias of its last axes, in x's dtype; the bias' gradient is a sum in float32 all the same."""
-    return x + jnp.broadcast_to(bias, x.shape).astype(x.dtype)
+    """x plus a float32 bias of its last axes, added in float32, as then the bias' gradient is summed; in x's dtype."""
+    return (x.astype(bias.dtype) + jnp.expand_dims(bias, range(x.ndim - bias.ndim))).astype(x.dtype)
 
 
 class Linear(nn.Module):

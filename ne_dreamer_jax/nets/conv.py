@@ -2,7 +2,7 @@
 
 On accelerators these are `lax.conv_general_dilated` and plain compositions around it. XLA's own convolutions are slow
 on a CPU, their gradients most of all and in bfloat16 inside of loops (twenty times float32's). There the work goes to
-`cpu_conv`: the same functions and gradients as matrix products over a few images at a time, in float32 whatever the
+`cpu.conv`: the same functions and gradients as matrix products over a few images at a time, in float32 whatever the
 dtype. (Patches are one matrix product as they are, see `embed_patches`.)
 
 On a mesh of CPU devices each takes its share of the images: the loop over chunks of a global array would otherwise run

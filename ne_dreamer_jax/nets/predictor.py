@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax.linen import initializers
 
-from ne_dreamer_jax.nets.blocks import Linear, kernel_init
+from ne_dreamer_jax.nets.blocks import Linear, add_bias, kernel_init
 from ne_dreamer_jax.settings import ranges
 from ne_dreamer_jax.settings.ranges import Depth, Width
 from ne_dreamer_jax.types import Array
@@ -139,7 +139,7 @@ class Predictor(nn.Module):
         check_length(c, length)
         x = jnp.stack([state, act], axis=2).reshape(batch, 2 * length, width)
         positions = self.param("positions", initializers.normal(0.02), (2 * c.positions, c.width), jnp.float32)
-        x = x + positions[None, : 2 * length].astype(self.dtype)
+        x = add_bias(x, positions[: 2 * length])
         mask = episode_causal_mask(is_first, across_episodes=self.across_episodes)
         for i in range(c.layers):
             x = TransformerLayer(c, self.dtype, name=f"layer{i}")(x, mask)
