@@ -24,6 +24,10 @@ class Common(NamedTuple):
     obs: str | None = None
     assignments: Sequence[str] = ()
 
+    def with_settings(self, assignments: Sequence[str]) -> Common:
+        """The same with further settings, applied last."""
+        return self._replace(assignments=(*self.assignments, *assignments))
+
     def options(self, task: str | None, method: str, seed: int) -> list[str]:
         """One run's options of `experiments.train`, as they are typed, without its directory."""
         options = ["--preset", self.preset]

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from experiments.common import Common, common
 from ne_dreamer_jax.commands.options import Name, Task, UserPath, find_devices, refusing, say
 from ne_dreamer_jax.files import write_text
 from ne_dreamer_jax.settings import names
@@ -54,40 +55,36 @@ SMALL = (
 @click.argument("variants", nargs=-1, required=True)
 @click.option("--task", "tasks", type=Task(), multiple=True, help="May be repeated. Default: the preset's.")
 @click.option("--method", type=Name("method", names.METHODS), default=names.METHODS[0])
-@click.option("--preset", type=Name("preset", names.PRESETS), default="quickstart")
-@click.option("--obs", type=Name("observation", names.OBSERVATIONS), help="pixels, vector or both.")
+@common("quickstart")
 @click.option("--small", is_flag=True, help="A small agent, for vectors.")
 @click.option("--seeds", type=click.IntRange(2, 1000), default=5, help="Seeds 0, 1, ... of each.")
-@click.option(
-    "--set", "assignments", metavar="PATH=VALUE", multiple=True, help="For all variants, as experiments.train."
-)
 def main(
     out: Path,
     variants: tuple[str, ...],
     tasks: tuple[str, ...],
     method: str,
-    preset: str,
-    obs: str | None,
     small: bool,
     seeds: int,
-    assignments: tuple[str, ...],
+    **settings: Any,
 ) -> None:
     """Trains what OUT does not hold yet, keeps a line for each variant and task in it, and prints the comparison."""
     quiet()
-    from experiments.train import configure
-
     if len(set(variants)) < len(variants):
         raise click.UsageError(f"expected variants that differ, got one twice: {' '.join(variants)}")
-    common = (*(SMALL if small else ()), *assignments)
-    if any(re.match(r"seed\s*=", setting.strip()) for text in (*common, *variants) for setting in _settings(text)):
+    shared = Common(**settings)
+    if small:
+        shared = shared._replace(assignments=(*SMALL, *shared.assignments))
+    if any(
+        re.match(r"seed\s*=", setting.strip())
+        for text in (*shared.assignments, *variants)
+        for setting in _settings(text)
+    ):
         raise click.UsageError("seed: each variant has the seeds 0, 1, ..., of which --seeds says how many")
     if strange := [text for text in variants if text != DEFAULT and "=" not in text]:
         raise click.UsageError(f"expected {DEFAULT!r} or PATH=VALUE as a variant, got {strange[0]!r}")
     with refusing(ValueError):
         made = {
-            (task, variant): configure(
-                preset, None, method, {"env.task": task, "env.obs": obs}, (*common, *_settings(variant))
-            )
+            (task, variant): shared.with_settings(_settings(variant)).config(task, method, 0)
             for task in tasks or (None,)
             for variant in variants
         }
